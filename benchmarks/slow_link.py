@@ -87,7 +87,7 @@ class NumberedViewer(NetworkViewer):
         started = time.perf_counter()
         image = super()._draw(request, gaussians)
         self.drawing.append(time.perf_counter() - started)
-        number = round((float(request.pose.position[0]) - self.left) / STEP)
+        number = round((float(request.view.position[0]) - self.left) / STEP)
         for bit in range(BITS):
             at = slice(bit * BLOCK, (bit + 1) * BLOCK)
             image[:BLOCK, at] = 255 * (number >> bit & 1)

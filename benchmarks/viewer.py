@@ -32,7 +32,7 @@ from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.process import single_threaded
 from snowsplat.viewer.live.curves import SampledPsnr
-from snowsplat.viewer.live.display import DisplaySettings
+from snowsplat.viewer.live.display import Display
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer
@@ -111,7 +111,7 @@ def images(name: str, repeats: int) -> None:
         times = []
         for _ in range(repeats):
             started = time.perf_counter()
-            draw(scene.gaussians, scene.camera, DisplaySettings(mode))
+            draw(scene.gaussians, scene.camera, Display(mode))
             times.append(time.perf_counter() - started)
         print(f"{mode:15} {milliseconds(times)}")
 

@@ -20,7 +20,7 @@ from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.initial_view import overview
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import Message
-from snowsplat.viewer.http.served_file import FileOnDisk
+from snowsplat.viewer.http.static import FileOnDisk
 
 
 @pytest.fixture

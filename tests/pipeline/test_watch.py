@@ -29,15 +29,15 @@ def test_the_newest_scene_is_shown(trained, tmp_path):
     shutil.copytree(trained, out)
     folder = TrainingFolder(out)
     scene = NewestScene(folder, None)()
-    assert scene.about[0] == "After 50 steps"
-    assert NewestScene(folder, 20)().about[0] == "After 20 steps"
+    assert scene.about[0].text("en") == "After 50 steps"
+    assert NewestScene(folder, 20)().about[0].text("en") == "After 20 steps"
     with pytest.raises(UserError, match="no scene of iteration 7; there are 20, 50"):
         NewestScene(folder, 7)()
 
     shutil.rmtree(out / "point_cloud/iteration_50")
     newest = NewestScene(folder, None)
     of_checkpoint = newest()
-    assert of_checkpoint.about[0] == "After 40 steps"
+    assert of_checkpoint.about[0].text("en") == "After 40 steps"
     tensors = checkpoint.latest(folder.checkpoints).tensors
     assert of_checkpoint.gaussians.means.equal(tensors["gaussians.means"])
     assert of_checkpoint.gaussians.antialiased
@@ -51,13 +51,13 @@ def test_the_newest_scene_is_shown(trained, tmp_path):
     assert newest() is of_checkpoint
     shutil.copyfile(trained / "point_cloud/iteration_50/point_cloud.ply", path)
     later = newest()
-    assert later.about[0] == "After 50 steps"
+    assert later.about[0].text("en") == "After 50 steps"
     assert later.number != of_checkpoint.number
     shutil.rmtree(out / "point_cloud")
     shutil.rmtree(out / "checkpoints")
     assert newest() is later  # as while the files are replaced
     assert NewestScene(folder, None)().gaussians is None
-    assert "--checkpoint-every" in " ".join(NewestScene(folder, None)().about)
+    assert "--checkpoint-every" in " ".join(map(str, NewestScene(folder, None)().about))
 
 
 def test_a_checkpoint_of_something_else(trained, tmp_path):

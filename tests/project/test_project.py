@@ -96,13 +96,6 @@ def test_after_the_last_part_no_photo_judges_the_scene(made):
     assert not Project.open(evaluated).has_seen_all_photos
 
 
-@pytest.mark.parametrize("steps", [0, 240])
-def test_a_record_before_version_0_3_tells_the_last_part_by_its_steps(made, steps):
-    last = {"all": {"result": {"steps": steps}}}
-    (made / "make.json").write_text(json.dumps({"file": "garden.ply", "stages": last}))
-    assert Project.open(made).has_seen_all_photos == (steps > 0)
-
-
 @pytest.mark.parametrize("record", ["{", "[]", '{"file": 5, "title": []}', '{"file": "../x.ply"}'])
 def test_damaged_record_of_make(made, record):
     (made / "make.json").write_text(record)

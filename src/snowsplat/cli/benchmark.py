@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from snowsplat.cli.command import Exit, JsonCommand
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.options.benchmark import BenchmarkOptions
-from snowsplat.util.messages import message
 from snowsplat.util.settings import group, needed
 
 
@@ -50,11 +50,9 @@ class Benchmark(JsonCommand):
         report = benchmark(
             self.folder, self.output, self.options, on_line=lambda line: print(line, flush=True)
         )
-        print(
-            message(
-                "\n{report}\n\n{output}: the results as a page",
-                report=report,
-                output=self.output / "index.html",
-            )
+        print_message(
+            "\n{report}\n\n{output}: the results as a page",
+            report=report,
+            output=self.output / "index.html",
         )
         return Exit(2 if report.failures else 0, report)

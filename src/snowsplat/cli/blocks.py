@@ -9,6 +9,7 @@ from typing import Literal
 from snowsplat.cli.command import Command, Exit
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.benchmark import PlanOptions
@@ -100,17 +101,15 @@ class Blocks(Command):
         plan = plan_blocks(dataset, self.output, self.planned)
         for block in plan.blocks:
             limit = f"{block.max_gaussians:,}" if block.max_gaussians else message("no limit")
-            print(
-                message(
-                    "{name}: {views} photos, {points:,} points, at most {limit} Gaussians",
-                    name=self.output / block.name,
-                    views=block.views,
-                    points=block.points,
-                    limit=limit,
-                )
+            print_message(
+                "{name}: {views} photos, {points:,} points, at most {limit} Gaussians",
+                name=self.output / block.name,
+                views=block.views,
+                points=block.points,
+                limit=limit,
             )
         if distance := plan.settings.get("sky_distance"):
-            print(message("distance of the sky in all of them: {distance:g}", distance=distance))
+            print_message("distance of the sky in all of them: {distance:g}", distance=distance)
         print(next_step(message("train them with"), "blocks", "train", self.output))
         return None
 
@@ -129,7 +128,7 @@ class Blocks(Command):
                     on_block=lambda line: print(line, flush=True),
                 )
             except TrainingStopped as stopped:
-                print(message("{stopped}; continue with the same command", stopped=stopped))
+                print_message("{stopped}; continue with the same command", stopped=stopped)
                 return Exit(130)
         print(next_step(message("when all blocks are trained"), "blocks", "merge", folder))
         return None
@@ -139,19 +138,15 @@ class Blocks(Command):
 
         merged = merge_blocks(folder, self.output)
         kept, trained = sum(merged.gaussians), sum(merged.trained)
-        print(
-            message(
-                "{scene}: {kept:,} Gaussians of {gaussians} blocks",
-                scene=merged.scene,
-                kept=kept,
-                gaussians=len(merged.gaussians),
-            )
+        print_message(
+            "{scene}: {kept:,} Gaussians of {gaussians} blocks",
+            scene=merged.scene,
+            kept=kept,
+            gaussians=len(merged.gaussians),
         )
-        print(
-            message(
-                "{kept:,} Gaussians outside of the cells of their blocks are left out",
-                kept=trained - kept,
-            )
+        print_message(
+            "{kept:,} Gaussians outside of the cells of their blocks are left out",
+            kept=trained - kept,
         )
         print(see_and_share(folder))
         return None

@@ -9,6 +9,7 @@ from typing import Any
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
 from snowsplat.util.messages import message
@@ -57,17 +58,15 @@ class Clean(JsonCommand):
                 observer=observer,
             )
         before, after = done.psnr
-        print(
-            message(
-                "{target}: {after:,} of {before:,} Gaussians removed; PSNR of {compared} "
-                "{before2:.2f} dB before, {after2:.2f} dB after",
-                target=self.target,
-                after=done.before - done.after,
-                before=done.before,
-                compared=done.compared,
-                before2=before,
-                after2=after,
-            )
+        print_message(
+            "{target}: {after:,} of {before:,} Gaussians removed; PSNR of {compared} "
+            "{before2:.2f} dB before, {after2:.2f} dB after",
+            target=self.target,
+            after=done.before - done.after,
+            before=done.before,
+            compared=done.compared,
+            before2=before,
+            after2=after,
         )
         print(see_and_share(self.target))
         return {"file": self.target, "bytes": self.target.stat().st_size, **vars(done)}

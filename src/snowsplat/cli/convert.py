@@ -9,11 +9,11 @@ from typing import Any
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.convert import Edits
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import message
 from snowsplat.util.settings import argument, group, setting, switch
 
 
@@ -119,13 +119,11 @@ class Convert(JsonCommand):
             )
         size = format.size(target)
         written = f"{format_bytes(size)} of {format.name}"
-        print(
-            message(
-                "{target}: {written}; lost in this format: {loses}",
-                target=target,
-                written=written,
-                loses=format.loses,
-            )
+        print_message(
+            "{target}: {written}; lost in this format: {loses}",
+            target=target,
+            written=written,
+            loses=format.loses,
         )
         page = format.name == "HTML"
         print(f"to see it: open {target} in a browser" if page else see_and_share(target))

@@ -11,9 +11,9 @@ from snowsplat.cli.command import Command, Exit
 from snowsplat.cli.make import print_summary
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.cli.view import View
 from snowsplat.util.flags import command_line, with_flags, words
-from snowsplat.util.messages import message
 from snowsplat.util.settings import setting, switch
 
 if TYPE_CHECKING:
@@ -56,11 +56,9 @@ class Demo(Command):
                 result = demo(self.output, observer=observer)
         except KeyboardInterrupt as stopped:
             print(with_flags(str(stopped) or "stopped"))
-            print(
-                message(
-                    "resume with: {command_line}",
-                    command_line=command_line("demo", words(Demo, self.given)),
-                )
+            print_message(
+                "resume with: {command_line}",
+                command_line=command_line("demo", words(Demo, self.given)),
             )
             return Exit(130)
         print_summary(result.made)
@@ -74,8 +72,8 @@ class Demo(Command):
             return Exit(1)
         scene = result.made.project.path
         if not self.open:
-            print(message("\n{see_and_share}", see_and_share=see_and_share(scene)))
-            print(message("with your own photos: snowsplat make PHOTOS"))
+            print_message("\n{see_and_share}", see_and_share=see_and_share(scene))
+            print_message("with your own photos: snowsplat make PHOTOS")
             return None
         View(path=scene).run()
         return None
@@ -86,20 +84,17 @@ def _print_errors(errors: PoseErrors) -> None:
 
     degrees, shares = errors.rotations, errors.centres
     found, total = len(errors.names), len(errors.names) + len(errors.missing)
-    print(
-        message(
-            "\nEstimated poses compared with the true ones ({found} of {total} "
-            "photos)\n                            median     worst      limit\n  "
-            "rotation                  {median:.3f}\xb0     {max:.3f}\xb0     {max_degrees}\xb0\n  "
-            "position, of the extent   {median2:.3%}     {max2:.3%}     {max_share:.1%}",
-            found=found,
-            total=total,
-            median=degrees.median(),
-            max=degrees.max(),
-            max_degrees=MAX_DEGREES,
-            median2=shares.median(),
-            max2=shares.max(),
-            max_share=MAX_SHARE,
-        ),
-        flush=True,
+    print_message(
+        "\nEstimated poses compared with the true ones ({found} of {total} "
+        "photos)\n                            median     worst      limit\n  "
+        "rotation                  {median:.3f}\xb0     {max:.3f}\xb0     {max_degrees}\xb0\n  "
+        "position, of the extent   {median2:.3%}     {max2:.3%}     {max_share:.1%}",
+        found=found,
+        total=total,
+        median=degrees.median(),
+        max=degrees.max(),
+        max_degrees=MAX_DEGREES,
+        median2=shares.median(),
+        max2=shares.max(),
+        max_share=MAX_SHARE,
     )

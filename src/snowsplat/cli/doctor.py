@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from snowsplat.cli.command import Exit, JsonCommand
-from snowsplat.util.messages import message
+from snowsplat.cli.print_message import print_message
 from snowsplat.util.safe_json import printable
 
 
@@ -37,9 +37,9 @@ class Doctor(JsonCommand):
         names = ", ".join(finding.name for finding in problems)
         if not self.json:
             if problems:
-                print(message("\nsee above: {names}", names=names))
+                print_message("\nsee above: {names}", names=names)
             else:
-                print(message("\nnothing is missing; to try it: snowsplat demo"))
+                print_message("\nnothing is missing; to try it: snowsplat demo")
         facts: dict[str, Any] = {finding.name: finding.values for finding in findings}
         facts["problems"] = [f"{finding.name}: {finding.text}" for finding in problems]
         return Exit(int(any(finding.essential for finding in problems)), facts)

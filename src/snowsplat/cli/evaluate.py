@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import next_step
+from snowsplat.cli.print_message import print_message
 from snowsplat.cli.scene_choice import SceneChoice
 from snowsplat.util.messages import message
 from snowsplat.util.settings import group, setting
@@ -84,7 +85,7 @@ class Evaluate(JsonCommand):
         )
         show(evaluation, "mean")
         if network is None:
-            print(message("LPIPS was not measured; to measure it: --lpips vgg"))
+            print_message("LPIPS was not measured; to measure it: --lpips vgg")
         where = scene.folder.metrics
         which = message(
             "{count} {split} views of {size}: {where}",

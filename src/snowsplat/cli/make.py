@@ -13,6 +13,7 @@ from snowsplat.cli.config_file import config
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import PageAddress
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.pipeline.stage_lines import photos_of_last_part
@@ -88,11 +89,9 @@ class Make(JsonCommand):
             except KeyboardInterrupt as stopped:
                 print(with_flags(str(stopped) or "stopped"))
                 again = {k: v for k, v in self.given.items() if k not in ("overwrite", "json")}
-                print(
-                    message(
-                        "resume with: {command_line}",
-                        command_line=command_line("make", words(Make, again)),
-                    )
+                print_message(
+                    "resume with: {command_line}",
+                    command_line=command_line("make", words(Make, again)),
                 )
                 return Exit(130)
             print_summary(result)
@@ -105,10 +104,10 @@ class Make(JsonCommand):
         """Show the scene until Ctrl-C, on the page of the training if there was one."""
         from snowsplat.formats import read_gaussians
 
-        if page.has_trained:
+        if page.training is not None:
             with suppress(KeyboardInterrupt):  # Ctrl-C may arrive before the scene is shown
                 gaussians = read_gaussians(made.scene)
-                print(message("the scene is shown at {url} until Ctrl-C", url=page.url), flush=True)
+                print_message("the scene is shown at {url} until Ctrl-C", url=page.url)
                 page.show_result(gaussians.to(self.options.compute.apply()))
             return
         from snowsplat.pipeline.watch import watch
@@ -121,15 +120,15 @@ def print_summary(made: MakeResult) -> None:
     """Print the files of a finished scene, its quality, and the verdict."""
     size = format_bytes(made.scene.stat().st_size)
     print()
-    print(message("The scene, for any viewer:  {scene} ({size})", scene=made.scene, size=size))
+    print_message("The scene, for any viewer:  {scene} ({size})", scene=made.scene, size=size)
     if made.dataset_report:
-        print(message("Report on camera poses:     {report}", report=made.dataset_report))
+        print_message("Report on camera poses:     {report}", report=made.dataset_report)
     else:
-        print(message("Camera poses:               those of {path}", path=made.dataset.path))
-    print(message("Report on the training:     {report}", report=made.training.report))
+        print_message("Camera poses:               those of {path}", path=made.dataset.path)
+    print_message("Report on the training:     {report}", report=made.training.report)
     for line in _quality(made):
         print(line)
-    print(message("Time:                       {time}", time=duration(made.seconds)))
+    print_message("Time:                       {time}", time=duration(made.seconds))
     if made.verdict is not None:
         print("\n" + "\n".join(made.verdict.lines(message("the scene"))))
     sys.stdout.flush()

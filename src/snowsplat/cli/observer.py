@@ -6,6 +6,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from snowsplat.cli.pages import for_other_computers
+from snowsplat.cli.print_message import print_message
 from snowsplat.cli.stage_progress import StageProgress
 from snowsplat.cli.step_progress import StepProgress, held_out_line
 from snowsplat.pipeline.observer import Observer
@@ -78,20 +79,18 @@ class TerminalObserver(Observer):
         count = message("{steps} more steps", steps=steps)
         if not result.first_step:
             count = message("{steps} steps", steps=steps)
-        print(
-            message(
-                "{scene}: {gaussians:,} Gaussians, {st_size}, {count} in {seconds}, {memory}",
-                scene=result.scene,
-                gaussians=result.gaussians,
-                st_size=format_bytes(result.scene.stat().st_size),
-                count=count,
-                seconds=duration(result.seconds),
-                memory=result.memory,
-            )
+        print_message(
+            "{scene}: {gaussians:,} Gaussians, {st_size}, {count} in {seconds}, {memory}",
+            scene=result.scene,
+            gaussians=result.gaussians,
+            st_size=format_bytes(result.scene.stat().st_size),
+            count=count,
+            seconds=duration(result.seconds),
+            memory=result.memory,
         )
         for line in result.reductions:
-            print(message("for lack of memory: {line}", line=line))
-        print(message("{report}: the report of the training", report=result.report))
+            print_message("for lack of memory: {line}", line=line)
+        print_message("{report}: the report of the training", report=result.report)
         if result.evaluation is not None:
             print(held_out_line(*result.evaluation))
         for part in result.parts.values():
@@ -99,11 +98,11 @@ class TerminalObserver(Observer):
                 print(each)
         if result.time is not None:
             spent, given = map(duration, result.time)
-            print(message("{spent} in total, of {given}", spent=spent, given=given))
+            print_message("{spent} in total, of {given}", spent=spent, given=given)
         sys.stdout.flush()
 
     def page_opened(self, page: Page) -> None:
-        print(message("watch it in a browser: {url}", url=page.url), flush=True)
+        print_message("watch it in a browser: {url}", url=page.url)
         for line in for_other_computers(page.url, page.others):
             print(line, flush=True)
 

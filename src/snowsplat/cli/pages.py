@@ -18,7 +18,7 @@ from functools import cache
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from snowsplat.util.messages import message
+from snowsplat.cli.print_message import print_message
 from snowsplat.viewer.hosts import LOCAL_HOST
 
 _OPENING_SECONDS = 5.0  # in which a browser gets its address
@@ -61,7 +61,7 @@ def show(
 
     ``opener``: the `opener_of` another process that shows the page; None: this process shows it.
     """
-    print(message("{how}: {url}", how=how, url=url), flush=True)
+    print_message("{how}: {url}", how=how, url=url)
     for line in for_other_computers(url, others):
         print(line, flush=True)
     if browser and has_screen():

@@ -9,6 +9,7 @@ from typing import Any
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.publish import PublishOptions
@@ -65,19 +66,14 @@ class Publish(JsonCommand):
                 threads=self.compute.threads,
                 observer=observer,
             )
-        print(
-            message(
-                "{folder}: {gaussians:,} Gaussians, {bytes}",
-                folder=result.folder,
-                gaussians=result.gaussians,
-                bytes=format_bytes(result.bytes),
-            )
+        print_message(
+            "{folder}: {gaussians:,} Gaussians, {bytes}",
+            folder=result.folder,
+            gaussians=result.gaussians,
+            bytes=format_bytes(result.bytes),
         )
         look = next_step(message("to look at it"), "view", result.folder)
-        print(
-            message(
-                "{look}; to share it: copy the folder to a web host, and send the address",
-                look=look,
-            )
+        print_message(
+            "{look}; to share it: copy the folder to a web host, and send the address", look=look
         )
         return result

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.cli.scene_choice import SceneChoice
 from snowsplat.pipeline.options.video import VideoOptions
 from snowsplat.util.errors import UserError
@@ -94,7 +95,7 @@ class Render(JsonCommand):
                 self.scene.load(), splits=splits, depth=self.depth, antialias=antialias
             )
         for folder, count in rendered.items():
-            print(message("{folder}: {count} images", folder=folder, count=count))
+            print_message("{folder}: {count} images", folder=folder, count=count)
         print(next_step(message("for a video"), "render", self.scene.path(), "--path", "ellipse"))
         return {"images": rendered}
 

@@ -9,6 +9,7 @@ from typing import Any
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.options import common
 from snowsplat.sfm.options import DatasetOptions
 from snowsplat.util.errors import UserError
@@ -69,15 +70,13 @@ class Sfm(JsonCommand):
             outcomes = make_dataset(inputs, folder, self.options, observer, self.overwrite)
         poses = outcomes["poses"].result
         found, count = len(poses["registered"]), len(poses["unregistered"])
-        print(
-            message(
-                "{folder}: {found} of {count} photos placed, {poses:,} points; see {result}",
-                folder=folder,
-                found=found,
-                count=found + count,
-                poses=poses["points"],
-                result=folder / outcomes["report"].result["file"],
-            )
+        print_message(
+            "{folder}: {found} of {count} photos placed, {poses:,} points; see {result}",
+            folder=folder,
+            found=found,
+            count=found + count,
+            poses=poses["points"],
+            result=folder / outcomes["report"].result["file"],
         )
         placement = placement_of(outcomes["images"].result)
         for line in placement.lines() if placement is not None else []:

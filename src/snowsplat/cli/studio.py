@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from snowsplat.cli.command import Command
 from snowsplat.cli.page_flags import PageServer
 from snowsplat.cli.pages import opener_of, show
+from snowsplat.cli.print_message import print_message
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import message
 from snowsplat.util.settings import argument, group
 from snowsplat.viewer.hosts import ANY_HOST, LOCAL_HOST, KnownHosts, is_loopback
 
@@ -77,7 +77,7 @@ class Studio(Command):
             with suppress(OSError):  # a full disk: then a second studio is refused
                 where = server.url, self.server.host, server.port, server.token, server.others
                 write_address(library.folder, Address(*where, str(opener_of(server.url))))
-            print(message("scenes are kept in {folder}", folder=library.folder))
+            print_message("scenes are kept in {folder}", folder=library.folder)
             self.server.serve(server)
 
     def _open(self, library: Library, address: Address) -> None:
@@ -93,7 +93,7 @@ class Studio(Command):
                 host=address.host,
                 port=address.port,
             )
-        print(message("scenes are kept in {folder}", folder=library.folder))
+        print_message("scenes are kept in {folder}", folder=library.folder)
         show(
             "a studio has them open already",
             address.url,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -21,80 +22,10 @@ class Subcommand:
 
 
 def _load(name: str) -> type[Command]:
-    match name:
-        case "studio":
-            from snowsplat.cli.studio import Studio
-
-            return Studio
-        case "demo":
-            from snowsplat.cli.demo import Demo
-
-            return Demo
-        case "make":
-            from snowsplat.cli.make import Make
-
-            return Make
-        case "sfm":
-            from snowsplat.cli.sfm import Sfm
-
-            return Sfm
-        case "train":
-            from snowsplat.cli.train import Train
-
-            return Train
-        case "evaluate":
-            from snowsplat.cli.evaluate import Evaluate
-
-            return Evaluate
-        case "render":
-            from snowsplat.cli.render import Render
-
-            return Render
-        case "view":
-            from snowsplat.cli.view import View
-
-            return View
-        case "watch":
-            from snowsplat.cli.watch import Watch
-
-            return Watch
-        case "convert":
-            from snowsplat.cli.convert import Convert
-
-            return Convert
-        case "clean":
-            from snowsplat.cli.clean import Clean
-
-            return Clean
-        case "mesh":
-            from snowsplat.cli.mesh import Mesh
-
-            return Mesh
-        case "points":
-            from snowsplat.cli.points import Points
-
-            return Points
-        case "publish":
-            from snowsplat.cli.publish import Publish
-
-            return Publish
-        case "benchmark":
-            from snowsplat.cli.benchmark import Benchmark
-
-            return Benchmark
-        case "blocks":
-            from snowsplat.cli.blocks import Blocks
-
-            return Blocks
-        case "info":
-            from snowsplat.cli.info import Info
-
-            return Info
-        case "doctor":
-            from snowsplat.cli.doctor import Doctor
-
-            return Doctor
-    raise KeyError(name)
+    # Only modules of this package; a package above hands over a function, see `extras.register`.
+    module = import_module(f"{__package__}.{name}")
+    found: type[Command] = getattr(module, name.capitalize())
+    return found
 
 
 SUBCOMMANDS = {

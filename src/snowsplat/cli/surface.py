@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.surface import MeshOptions
@@ -53,18 +54,16 @@ class SurfaceCommand(JsonCommand):
 
     def reported(self, surface: Surface, what: Message, hint: Message) -> dict[str, Any]:
         """Print the lines of the result; returns it for --json."""
-        print(
-            message(
-                "{output}: {what} from {photos} photos, with voxels of {voxel:.3g}",
-                output=self.output,
-                what=what,
-                photos=surface.photos,
-                voxel=surface.voxel,
-            )
+        print_message(
+            "{output}: {what} from {photos} photos, with voxels of {voxel:.3g}",
+            output=self.output,
+            what=what,
+            photos=surface.photos,
+            voxel=surface.voxel,
         )
         if surface.closer:
-            print(
-                message("finer voxels do not fit into memory; a smaller --far makes room for them")
+            print_message(
+                "finer voxels do not fit into memory; a smaller --far makes room for them"
             )
         print(hint)
         told = {name: value for name, value in vars(surface).items() if name != "mesh"}

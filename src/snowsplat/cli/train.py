@@ -14,6 +14,7 @@ from snowsplat.cli.config_file import config, training_in
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import PageAddress
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.util.errors import UserError
@@ -163,10 +164,7 @@ class Train(JsonCommand):
                 print(see_and_share(self.output), flush=True)
             if page is not None:
                 with suppress(KeyboardInterrupt):  # Ctrl-C may arrive during the print
-                    print(
-                        message("the scene is shown at {url} until Ctrl-C", url=page.url),
-                        flush=True,
-                    )
+                    print_message("the scene is shown at {url} until Ctrl-C", url=page.url)
                     page.show_result()
         step, metrics = result.evaluation or (None, None)
         measured = None if metrics is None else {"step": step, **metrics.as_json()}

@@ -9,8 +9,8 @@ from pathlib import Path
 from snowsplat.cli.command import Command
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import PageServer
+from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.options import common
-from snowsplat.util.messages import message
 from snowsplat.util.settings import group, needed
 
 
@@ -56,8 +56,8 @@ class View(Command):
             self.server.open(static_app(scene.files), scene.headers) as server,
         ):
             if scene.gaussians is None:
-                print(message("{file}: a web site", file=scene.file))
+                print_message("{file}: a web site", file=scene.file)
             else:
                 count = scene.gaussians
-                print(message("{file}: {count:,} Gaussians", file=scene.file, count=count))
+                print_message("{file}: {count:,} Gaussians", file=scene.file, count=count)
             self.server.serve(server)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from snowsplat.data.dataset import PosedImage
 from snowsplat.data.files.photo_files import warn_of_unusable
+from snowsplat.data.maps.mask_pixels import has_shape
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, Header, read_header
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
@@ -101,24 +102,13 @@ def with_sizes(root: Path, posed: list[PosedImage]) -> list[tuple[PosedImage, Im
     sized = []
     for image, header, factor, oriented in found:
         size = (header.height, header.width) if oriented else (header.width, header.height)
-        camera = image.camera
         used = ImageSize(*size, oriented, header.width * header.height)
-        try:
-            if factor is None or not _is_divided(camera, size, usual[image.folder]):
-                raise UserError(
-                    "{path}: is {width}x{height}, but its camera is {width2}x{height2}; use the "
-                    "images that the poses were estimated from, or scale all of them by one factor",
-                    path=image.path,
-                    width=header.width,
-                    height=header.height,
-                    width2=camera.width,
-                    height2=camera.height,
-                )
-            if image.mask is not None:
-                _check_mask(image.mask, used)
+        fits = factor is not None and _is_divided(image.camera, size, usual[image.folder])
+        wrong = _wrong_mask(image, used) if fits else _other_size(image, header)
+        if wrong is None:
             sized.append((image, used))
-        except UserError as error:
-            errors[image.name] = error
+        else:
+            errors[image.name] = wrong
     warn_of_unusable(root, errors, len(sized))
     for folder, factor in usual.items():
         if factor != 1 and not folder.name.endswith(f"_{factor:g}"):
@@ -150,21 +140,39 @@ def _shrink_factor(image: PosedImage, header: Header) -> tuple[float | None, boo
     return None, False
 
 
-def _check_mask(path: Path, size: ImageSize) -> None:
-    """Raise `UserError` if a mask has another aspect ratio than its image; it may be smaller."""
-    width, height = size.width, size.height
-    mask = read_header(path)
+def _other_size(image: PosedImage, header: Header) -> UserError:
+    camera = image.camera
+    return UserError(
+        "{path}: is {width}x{height}, but its camera is {width2}x{height2}; use the images that "
+        "the poses were estimated from, or scale all of them by one factor",
+        path=image.path,
+        width=header.width,
+        height=header.height,
+        width2=camera.width,
+        height2=camera.height,
+    )
+
+
+def _wrong_mask(image: PosedImage, size: ImageSize) -> UserError | None:
+    """Why the mask of an image cannot be used; it may be smaller than the image."""
+    if image.mask is None:
+        return None
+    try:
+        mask = read_header(image.mask)
+    except UserError as error:
+        return error
     own = (mask.width, mask.height)
     if size.oriented and mask.sideways:
         own = (mask.height, mask.width)
     # Sides are rounded to whole pixels of the mask, or of an image that is smaller.
-    if abs(own[0] * height - own[1] * width) > max(width, height, *own):
-        raise UserError(
-            "{path}: the mask is {own}x{own2}, but its image is {width}x{height}; use a mask of "
-            "the whole image",
-            path=path,
-            own=own[0],
-            own2=own[1],
-            width=width,
-            height=height,
-        )
+    if has_shape(own, (size.width, size.height)):
+        return None
+    return UserError(
+        "{path}: the mask is {own}x{own2}, but its image is {width}x{height}; use a mask of "
+        "the whole image",
+        path=image.mask,
+        own=own[0],
+        own2=own[1],
+        width=size.width,
+        height=size.height,
+    )

@@ -25,7 +25,7 @@ from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import make_parent
+from snowsplat.util.files import check_target, make_parent
 from snowsplat.util.process import single_threaded
 
 _VIEWS = 24  # at most so many photos are compared, evenly chosen
@@ -77,8 +77,7 @@ def clean(
         OSError: ``target`` cannot be written.
     """
     scene, target = Path(scene), Path(target)
-    if target.exists() and not overwrite:
-        raise UserError("{target}: exists; use `overwrite` to replace it", target=target)
+    check_target(target, overwrite)
     format_for_writing(target)
     device = (compute or Compute()).apply()
     with observer.waiting("reading"):

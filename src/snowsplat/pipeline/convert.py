@@ -30,8 +30,8 @@ from snowsplat.project.project import Project
 from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
-from snowsplat.util.errors import SettingError, UserError
-from snowsplat.util.files import make_parent
+from snowsplat.util.errors import SettingError
+from snowsplat.util.files import check_target, make_parent
 from snowsplat.util.messages import Message, message
 from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description, made_on
@@ -76,10 +76,7 @@ def convert(
         OSError: ``target`` cannot be written.
     """
     target, edits = Path(target), edits or Edits()
-    if target.is_dir():
-        raise UserError("{target}: is a folder; use a file name", target=target)
-    if target.exists() and not overwrite:
-        raise UserError("{target}: exists; use `overwrite` to replace it", target=target)
+    check_target(target, overwrite)
     format = format_for_writing(target)
     if spz_version is not None and format.name != "SPZ":
         raise SettingError(

@@ -27,7 +27,7 @@ from snowsplat.surface.isosurface import zero_level
 from snowsplat.surface.volume import Report, fuse_maps, occupied_blocks
 from snowsplat.training.starts.photos import decoded_ahead, reduced_photo, usable_pixels
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import make_parent
+from snowsplat.util.files import check_target, make_parent
 from snowsplat.util.process import single_threaded
 from snowsplat.util.process_memory import return_unused
 
@@ -91,10 +91,7 @@ def write_mesh(
     """
     kinds = mesh_files.POINTS_SUFFIXES if points else mesh_files.MESH_SUFFIXES
     mesh_files.check_suffix(target, kinds)
-    if target.exists() and not overwrite:
-        raise UserError("{target}: exists; use `overwrite` to replace it", target=target)
-    if target.is_dir():
-        raise UserError("{target}: a folder; use the name of a file", target=target)
+    check_target(target, overwrite)
     with observer.waiting("reading"):
         scene = load()
     surface = surface_of(scene, options or MeshOptions(), observer)

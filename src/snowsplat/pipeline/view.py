@@ -17,7 +17,7 @@ from snowsplat.project.project import Project
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
-from snowsplat.viewer.http.served_file import Served
+from snowsplat.viewer.http.static import Served
 from snowsplat.viewer.web.panel import Description, made_on
 from snowsplat.viewer.web.publication import PAGE, is_site, site_files
 from snowsplat.viewer.web.scene import ready, site

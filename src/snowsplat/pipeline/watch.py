@@ -25,13 +25,15 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import from_json, parse_json
 from snowsplat.viewer.live.viewer import Scene
 
 _NOTHING = [
-    "Nothing is saved yet.",
-    "With --checkpoint-every N, training saves the scene every N steps; it then appears here.",
+    message("Nothing is saved yet."),
+    message(
+        "With --checkpoint-every N, training saves the scene every N steps; it then appears here."
+    ),
 ]
 
 
@@ -71,8 +73,7 @@ def watch(
     newest = NewestScene(folder, iteration, (compute or Compute()).apply(), data.origin)
     newest()  # a scene that cannot be shown is reported before the page opens
     with suppress(KeyboardInterrupt):  # Ctrl-C is the normal end as soon as the page is open
-        page.open(data, background, project.name, observer)
-        page.show(newest)
+        page.open(data, background, project.name, observer).show_newest(newest)
 
 
 def _attached(output: Path, page: LivePage, observer: Observer) -> bool:
@@ -142,7 +143,11 @@ class NewestScene:
             if self._scene is None or self._read != found:
                 gaussians = self._gaussians(path).to(self._device)
                 name = path.relative_to(self._folder.path).as_posix()
-                about = [f"After {step:,} steps", f"{len(gaussians):,} Gaussians", name]
+                about = [
+                    message("After {steps:,} steps", steps=step),
+                    message("{gaussians:,} Gaussians", gaussians=len(gaussians)),
+                    Message(name),
+                ]
                 self._scene, self._read = Scene(gaussians, found[1], about), found
         except (OSError, UserError):
             # The file was replaced or removed: it is read again at the next call.

@@ -147,12 +147,7 @@ class Project:
         if self.scene is None or self.edit is not None:
             return False
         is_made = self.scene.resolve() == _scene_of_make(self.scene.resolve().parent, self.made)
-        if not is_made or "last_part" in self.made:
-            return is_made and self.made["last_part"] is True
-        try:  # the record of a version before 0.3
-            return bool(self.made["stages"]["all"]["result"]["steps"] > 0)
-        except (KeyError, TypeError):
-            return False
+        return is_made and self.made.get("last_part") is True
 
 
 def is_output(folder: Path) -> bool:

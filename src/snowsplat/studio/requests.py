@@ -20,8 +20,7 @@ from snowsplat.studio.texts import in_languages
 from snowsplat.studio.uploads import NoSpace, WrongPart
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.safe_json import is_file
-from snowsplat.viewer.http.served_file import FileOnDisk, content_type
-from snowsplat.viewer.http.static import send_file
+from snowsplat.viewer.http.static import FileOnDisk, content_type, send_file
 
 
 @dataclass(frozen=True)

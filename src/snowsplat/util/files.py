@@ -158,6 +158,15 @@ def make_parent(path: Path) -> None:
         ) from None
 
 
+def check_target(path: Path, overwrite: bool) -> None:
+    """Raises UserError: a file may not be written here: this is a folder, or a file that is there
+    and not to be replaced."""
+    if path.is_dir():
+        raise UserError("{path}: is a folder; use a file name", path=path)
+    if path.exists() and not overwrite:
+        raise UserError("{path}: exists; use `overwrite` to replace it", path=path)
+
+
 def is_temporary(path: Path, names: Collection[str]) -> bool:
     """Whether ``path`` is a temporary file of `atomic_path` for a file with one of ``names``."""
     match = _TEMPORARY.fullmatch(path.name)

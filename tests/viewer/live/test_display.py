@@ -7,13 +7,14 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, quat_from_rotation
-from snowsplat.viewer.live.display import PhotoRectangle, Pose, fit
+from snowsplat.viewer.live.display import PhotoRectangle, View, fit
 
 
-def pose(fov: float = 1.0, width: int = 640, height: int = 480) -> Pose:
+def pose(fov: float = 1.0, width: int = 640, height: int = 480) -> View:
     eye = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     cam_from_world = look_at(eye, torch.zeros(3).double(), torch.tensor([0.0, -1.0, 0.0]).double())
-    return Pose(quat_from_rotation(cam_from_world[:, :3].T), eye, fov, width, height)
+    quat = quat_from_rotation(cam_from_world[:, :3].T)
+    return View(0, tuple(quat.tolist()), tuple(eye.tolist()), fov, width, height)
 
 
 def test_the_camera_of_a_browser():

@@ -106,7 +106,7 @@ def test_an_image_that_cannot_be_rendered_does_not_end_the_training(watched):
         while not session._visitors:
             watched.step()
         (seen,) = session._visitors.values()
-        while seen.pose is None:
+        while seen.view is None:
             watched.step()
         session.change(seen, display=dataclasses.replace(seen.display, crop=((0.0,), (1.0, 2.0))))
         time.sleep(0.3)  # it is still
@@ -171,6 +171,6 @@ def test_few_images_are_rendered_while_none_is_sent(watched, monkeypatch):
         watched.viewer.server.call(time.sleep, 1.0)
         first, end = len(drawn), time.monotonic() + 0.8
         while time.monotonic() < end:
-            watched.viewer.session.move(seen, seen.pose)
+            watched.viewer.session.move(seen, seen.view)
             watched.step()
         assert len(drawn) - first <= 3

@@ -5,17 +5,8 @@ import math
 
 import pytest
 
-from snowsplat.viewer.live.messages import (
-    Display,
-    Key,
-    Share,
-    Shown,
-    Thumbnails,
-    Training,
-    View,
-    parse,
-    to_json,
-)
+from snowsplat.viewer.live.display import Display, View
+from snowsplat.viewer.live.messages import Key, Share, Shown, Thumbnails, Training, parse, to_json
 
 from .. import clients
 
@@ -23,12 +14,11 @@ from .. import clients
 def test_messages_of_the_page():
     seen = parse(clients.view(number=7, position=[1, 2.5, -3], photo=2))
     assert isinstance(seen, View)
-    pose = seen.pose()
-    assert (pose.number, seen.photo) == (7, 2)
-    assert pose.position.tolist() == [1.0, 2.5, -3.0]
+    assert (seen.number, seen.photo) == (7, 2)
+    assert seen.camera(4, 3).position.tolist() == [1.0, 2.5, -3.0]
     shown = parse(clients.display(mode="depth", crop=[[0, 0, 0], [1, 1, 1]]))
     assert isinstance(shown, Display)
-    assert shown.settings().crop == ((0, 0, 0), (1, 1, 1))
+    assert shown.crop == ((0, 0, 0), (1, 1, 1))
     assert parse('{"type": "shown", "number": 3}') == Shown(3)
     assert parse('{"type": "training", "do": "pause"}') == Training("pause")
     assert parse('{"type": "share", "share": 0.3}') == Share(0.3)
@@ -46,15 +36,14 @@ def test_other_messages_are_refused():
             refused += 1
             continue
         if isinstance(message, View):
-            assert message.pose().camera(4, 3).is_finite(), text
+            assert message.camera(4, 3).is_finite(), text
         elif isinstance(message, Display):
-            settings = message.settings()
-            assert 320 <= message.longest_side <= 2560, text
-            assert 0 <= settings.sh_degree <= 3, text
-            assert 0.02 <= settings.scale <= 1.0, text
-            assert 0.0 <= settings.wipe <= 1.0, text
+            assert 320 <= message.longest <= 2560, text
+            assert 0 <= message.degree <= 3, text
+            assert 0.02 <= message.scale <= 1.0, text
+            assert 0.0 <= message.wipe <= 1.0, text
         elif isinstance(message, Share):
-            assert 0.05 <= message.limited() <= 0.95, text
+            assert 0.05 <= message.share <= 0.95, text
     assert refused > 200
     for text in ("[" * 4000, "[" * 60_000, "9" * 4000, clients.view()[:-9], "\ufeff", "\0"):
         with pytest.raises(ValueError):  # noqa: PT011 - any one

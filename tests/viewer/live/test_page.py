@@ -93,7 +93,7 @@ def test_invalid_messages_are_ignored(viewer, dataset, capfd, caplog):
         visitor.socket.send(b"\x00\x01")
         visitor.view(position=[0.0, 1.0, -3.0])
         seen = viewer.session._visitors
-        wait_until(lambda: [v for v in seen.values() if v.pose and v.pose.position[1] == 1.0])
+        wait_until(lambda: [v for v in seen.values() if v.view and v.view.position[1] == 1.0])
     threads = [
         threading.Thread(target=hostile, args=(kind, viewer.url, 1.0)) for kind in sorted(HOSTILE)
     ]
@@ -125,7 +125,7 @@ def test_a_client_that_does_not_read_is_not_read_from(viewer):
     """States that are not received replace one another; its messages are not read."""
     with upgrade(viewer.url) as client:
         client.sendall(frame(view()))
-        wait_until(lambda: len(viewer._browsers) == 1 and next(iter(viewer._browsers)).visitor.pose)
+        wait_until(lambda: len(viewer._browsers) == 1 and next(iter(viewer._browsers)).visitor.view)
         (browser,) = viewer._browsers
         before = 0.0
         for i in range(60):  # 60 MB if all were kept
@@ -182,7 +182,7 @@ def test_a_photo_that_cannot_be_read_is_named(tmp_path):
             visitor.view(photo=1)
             told = visitor.wait_for("photo")
             assert told["index"] == 1
-            assert dataset.train[1].name in told["error"]
+            assert dataset.train[1].name in told["error"]["en"]
             visitor.view(photo=0)
             wait_until(lambda: [v for v in viewer.session._visitors.values() if v.photo_view])
             for count, thumbnails in ((1, {0}), (10**9, {0, 2})):

@@ -9,7 +9,7 @@ import torch
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import SH_C0, Gaussians
 from snowsplat.scene.render import render
-from snowsplat.viewer.live.display import DisplaySettings, PhotoRectangle
+from snowsplat.viewer.live.display import Display, PhotoRectangle
 from snowsplat.viewer.live.pictures import DEPTH, HEAT, Photo, draw
 
 WIDTH, HEIGHT = 90, 60
@@ -39,7 +39,7 @@ def at(picture: np.ndarray, column: int, row: int = 30) -> list[int]:
 
 
 def test_colours_are_those_of_a_render():
-    picture = draw(TWO, CAMERA, DisplaySettings(), torch.tensor([0.0, 0.0, 1.0]))
+    picture = draw(TWO, CAMERA, Display(), torch.tensor([0.0, 0.0, 1.0]))
     assert picture.shape == (HEIGHT, WIDTH, 3)
     assert picture.dtype == np.uint8
     image = render(TWO, CAMERA, torch.tensor([0.0, 0.0, 1.0])).image
@@ -53,7 +53,7 @@ def test_depth_grows_from_yellow_to_violet():
     far = [float(x) for x in np.linspace(2.0, 8.0, 5)]
     row = balls(*[((i - 2) * 0.15 * z, 0.0, z) for i, z in enumerate(far)], colors=[RED] * 5)
     row.log_scales = torch.log(0.04 * torch.tensor(far))[:, None].repeat(1, 3)
-    picture = draw(row, CAMERA, DisplaySettings("depth"))
+    picture = draw(row, CAMERA, Display("depth"))
     # The place of each colour in the palette.
     table = DEPTH.numpy().astype(int)
     places = [
@@ -64,11 +64,11 @@ def test_depth_grows_from_yellow_to_violet():
     assert places[0] > 240
     assert places[4] < 30
     assert at(picture, 45, 2) == [0, 0, 0]  # empty
-    assert not draw(balls((0.0, 0.0, -1.0)), CAMERA, DisplaySettings("depth")).any()
+    assert not draw(balls((0.0, 0.0, -1.0)), CAMERA, Display("depth")).any()
 
 
 def test_opacity():
-    picture = draw(TWO, CAMERA, DisplaySettings("alpha"), torch.ones(3))
+    picture = draw(TWO, CAMERA, Display("alpha"), torch.ones(3))
     assert at(picture, 25)[0] > 230
     assert len(set(at(picture, 25))) == 1
     assert at(picture, 5) == [0, 0, 0]
@@ -79,12 +79,12 @@ def test_normals_are_the_shortest_axes_towards_the_camera(sign):
     flat = balls((0.0, 0.0, 2.0))
     flat.log_scales[0, 2] = math.log(0.001)
     flat.quats = sign * flat.quats
-    red, green, blue = at(draw(flat, CAMERA, DisplaySettings("normals")), 45)
+    red, green, blue = at(draw(flat, CAMERA, Display("normals")), 45)
     assert (red, green) == pytest.approx((128, 128), abs=4)
     assert blue > 250
     # Rotated about the vertical axis by 45° it faces right or left.
     flat.quats = torch.tensor([[math.cos(math.pi / 8), 0.0, math.sin(math.pi / 8), 0.0]])
-    red, green, blue = at(draw(flat, CAMERA, DisplaySettings("normals")), 45)
+    red, green, blue = at(draw(flat, CAMERA, Display("normals")), 45)
     assert red == pytest.approx(255 * (0.5 - 0.5 / math.sqrt(2)), abs=6)
     assert green == pytest.approx(128, abs=4)
     assert blue == pytest.approx(255 * (0.5 + 0.5 / math.sqrt(2)), abs=6)
@@ -95,14 +95,14 @@ def shown(picture: np.ndarray) -> int:
 
 
 def test_points_are_small_and_have_their_colours():
-    picture = draw(TWO, CAMERA, DisplaySettings("points"))
+    picture = draw(TWO, CAMERA, Display("points"))
     assert 2 <= shown(picture) < 40
     assert at(picture, 65)[1] > at(picture, 65)[0]
-    assert np.array_equal(picture, draw(TWO, CAMERA, DisplaySettings("points", scale=0.1)))
+    assert np.array_equal(picture, draw(TWO, CAMERA, Display("points", scale=0.1)))
 
 
 def test_ellipsoids_are_opaque_discs_with_an_edge():
-    picture = draw(balls((0.0, 0.0, 2.0), opacity=0.5), CAMERA, DisplaySettings("ellipsoids"))
+    picture = draw(balls((0.0, 0.0, 2.0), opacity=0.5), CAMERA, Display("ellipsoids"))
     radius = 1.5 * math.hypot(
         80 * 0.12 / 2, math.sqrt(0.3)
     )  # of the splat, with the low-pass filter of 0.3 pixels²
@@ -111,9 +111,7 @@ def test_ellipsoids_are_opaque_discs_with_an_edge():
     assert values.max() == pytest.approx(0.9 * 255, abs=6)
     between = (values > 20) & (values < 200)
     assert between.sum() <= 4
-    assert not draw(
-        balls((0.0, 0.0, 2.0), opacity=0.05), CAMERA, DisplaySettings("ellipsoids")
-    ).any()
+    assert not draw(balls((0.0, 0.0, 2.0), opacity=0.05), CAMERA, Display("ellipsoids")).any()
 
 
 def test_cost_counts_gaussians():
@@ -121,9 +119,7 @@ def test_cost_counts_gaussians():
     heat = HEAT.numpy().astype(int)
     places = []
     for n in (1, 2, 8):
-        picture = draw(
-            balls(*[place] * n, colors=[RED] * n, opacity=0.1), CAMERA, DisplaySettings("cost")
-        )
+        picture = draw(balls(*[place] * n, colors=[RED] * n, opacity=0.1), CAMERA, Display("cost"))
         places.append(int(np.abs(heat - picture[30, 45].astype(int)).sum(1).argmin()))
         assert at(picture, 2) == [0, 0, 0]
     expected = [255 * math.log1p(n) / math.log1p(256) for n in (1, 2, 8)]
@@ -132,14 +128,14 @@ def test_cost_counts_gaussians():
 
 def test_a_crop_removes_what_is_outside():
     crop = ((-1.0, -1.0, 1.0), (0.0, 1.0, 3.0))
-    picture = draw(TWO, CAMERA, DisplaySettings(crop=crop))
+    picture = draw(TWO, CAMERA, Display(crop=crop))
     assert at(picture, 25)[0] > 200
     assert at(picture, 65) == [0, 0, 0]
-    assert not draw(TWO, CAMERA, DisplaySettings(crop=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))).any()
+    assert not draw(TWO, CAMERA, Display(crop=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))).any()
 
 
 def test_scale_shrinks():
-    sizes = [shown(draw(TWO, CAMERA, DisplaySettings(scale=scale))) for scale in (1.0, 0.5, 0.2)]
+    sizes = [shown(draw(TWO, CAMERA, Display(scale=scale))) for scale in (1.0, 0.5, 0.2)]
     assert sizes[0] > 2 * sizes[1] > 4 * sizes[2] > 0
 
 
@@ -147,11 +143,11 @@ def test_sh_degree():
     views = TWO.clone()
     views.sh_rest[:, 1] = 1.0  # along z
     full, plain = (
-        draw(views, CAMERA, DisplaySettings(sh_degree=3)),
-        draw(views, CAMERA, DisplaySettings(sh_degree=0)),
+        draw(views, CAMERA, Display(degree=3)),
+        draw(views, CAMERA, Display(degree=0)),
     )
     assert not np.array_equal(full, plain)
-    assert np.array_equal(plain, draw(TWO, CAMERA, DisplaySettings()))
+    assert np.array_equal(plain, draw(TWO, CAMERA, Display()))
 
 
 def photo_of(picture: np.ndarray) -> Photo:
@@ -160,27 +156,27 @@ def photo_of(picture: np.ndarray) -> Photo:
 
 
 def test_the_error_of_equal_photo_and_render_is_zero():
-    colors = draw(TWO, CAMERA, DisplaySettings())
-    same = draw(TWO, CAMERA, DisplaySettings("error"), photo=photo_of(colors))
+    colors = draw(TWO, CAMERA, Display())
+    same = draw(TWO, CAMERA, Display("error"), photo=photo_of(colors))
     assert not same[:, 10:80].any()
     other = photo_of(colors)
     other.pixels[20:40, 40:50] = 255  # column 50 to 60 of the picture
-    error = draw(TWO, CAMERA, DisplaySettings("error"), photo=other)
+    error = draw(TWO, CAMERA, Display("error"), photo=other)
     assert error[30, 52].min() > 100
     assert not error[:20, 10:80].any()
-    without = draw(TWO, CAMERA, DisplaySettings("error"))
+    without = draw(TWO, CAMERA, Display("error"))
     assert np.array_equal(without, colors)
 
 
 def test_a_photo_is_wiped_over_the_render():
-    colors = draw(TWO, CAMERA, DisplaySettings())
+    colors = draw(TWO, CAMERA, Display())
     white = Photo(torch.full((60, 70, 3), 255, dtype=torch.uint8), PhotoRectangle(10, 0, 70, 60))
-    render_only = draw(TWO, CAMERA, DisplaySettings(), photo=white)
+    render_only = draw(TWO, CAMERA, Display(), photo=white)
     assert np.array_equal(render_only[:, 10:80], colors[:, 10:80])
-    half = draw(TWO, CAMERA, DisplaySettings(wipe=0.5), photo=white)
+    half = draw(TWO, CAMERA, Display(wipe=0.5), photo=white)
     assert (half[:, 10:45] == 255).all()
     assert np.array_equal(half[:, 46:80], colors[:, 46:80])
-    whole = draw(TWO, CAMERA, DisplaySettings(wipe=1.0), photo=white)
+    whole = draw(TWO, CAMERA, Display(wipe=1.0), photo=white)
     assert (whole[:, 10:80] == 255).all()
     assert whole[:, :10].max() <= 0.36 * 255  # darker around it
 
@@ -188,4 +184,4 @@ def test_a_photo_is_wiped_over_the_render():
 def test_an_empty_scene():
     nothing = TWO.select(torch.zeros(0, dtype=torch.int64))
     for mode in ("color", "depth", "alpha", "normals", "points", "ellipsoids", "cost", "error"):
-        assert not draw(nothing, CAMERA, DisplaySettings(mode)).any(), mode
+        assert not draw(nothing, CAMERA, Display(mode)).any(), mode

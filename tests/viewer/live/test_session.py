@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from snowsplat.scene.camera import Camera
-from snowsplat.viewer.live.display import DisplaySettings, Pose
+from snowsplat.viewer.live.display import Display, View
 from snowsplat.viewer.live.session import IDLE_SHARE, STILL, PhotoView, Session
 
 from ...waiting import wait_until
@@ -31,9 +31,8 @@ def session(clock) -> Session:
     return Session(clock)
 
 
-def pose(x: float = 0.0) -> Pose:
-    position = torch.tensor([x, 0.0, 0.0]).double()
-    return Pose(torch.tensor([1.0, 0, 0, 0]).double(), position, 1.0, 1600, 900)
+def pose(x: float = 0.0, photo: int | None = None) -> View:
+    return View(0, (1.0, 0.0, 0.0, 0.0), (x, 0.0, 0.0), 1.0, 1600, 900, photo)
 
 
 def serve(session: Session, clock: Clock, scene: int, seconds: float, training=True) -> str | None:
@@ -84,8 +83,8 @@ def test_every_change_needs_a_new_image(session, clock):
     session.move(visitor, pose())
     clock.now += 1
     assert serve(session, clock, 0, 0.01) == "still"
-    for change in ({"display": DisplaySettings("depth")}, {"longest": 320}):
-        session.change(visitor, **change)
+    for change in (Display("depth"), Display("depth", longest=320)):
+        session.change(visitor, display=change)
         clock.now += 1
         assert serve(session, clock, 0, 0.01, training=False) == "still", change
     assert session.next_request(0, training=False) is None
@@ -157,7 +156,7 @@ def test_a_change_during_rendering_needs_a_new_image(session, clock):
     request = session.next_request(0, training=False)
     session.move(visitor, pose(1))
     session.record_rendering(request, 0, 0.01)
-    assert session.next_request(0, training=False).pose.position[0] == 1
+    assert session.next_request(0, training=False).view.position[0] == 1
 
 
 # Pause
@@ -210,12 +209,12 @@ def test_a_photo_is_shown_only_at_its_pose(session, clock):
     visitor = session.enter(1)
     camera = Camera(4, 3, 5.0, 5.0, 2.0, 1.5, torch.eye(3, 4).double())
     first, second = (PhotoView(i, camera, np.zeros((3, 4, 3), np.uint8)) for i in range(2))
-    session.move(visitor, pose(5), 1)
+    session.move(visitor, pose(5, 1))
     session.show_photo(visitor, first)  # it was read too late
     assert visitor.photo_view is None
     session.show_photo(visitor, second)
     assert session.next_request(0, training=False).photo_view is second
-    session.move(visitor, replace(pose(5), width=800), 1)  # another size of the window
+    session.move(visitor, replace(pose(5, 1), width=800))  # another size of the window
     assert visitor.photo_view is second
     session.move(visitor, pose(5.1))
     assert visitor.photo_view is None

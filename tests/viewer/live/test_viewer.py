@@ -16,6 +16,7 @@ from snowsplat.data import load_dataset
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.util.messages import Message, message
 from snowsplat.viewer.live.curves import SampledPsnr
 from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
@@ -32,7 +33,7 @@ def test_a_newer_scene_replaces_the_one_shown(tmp_path):
     dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
     gaussians = Gaussians.from_points(dataset.points)
     few = gaussians.select(torch.arange(30))
-    saved, shown = [Scene(few, 1, ["30"])], []
+    saved, shown = [Scene(few, 1, [Message("30")])], []
     ended = threading.Event()
 
     def newest() -> Scene:
@@ -53,8 +54,8 @@ def test_a_newer_scene_replaces_the_one_shown(tmp_path):
             wait_until(lambda: 1 in shown)
             visitor.view()
             assert visitor.pictures(20.0, most=1) == 1
-            assert visitor.wait_for("about")["lines"] == ["30"]
-            saved.append(Scene(gaussians, 2, ["50"]))
+            assert visitor.wait_for("about")["lines"] == [{"en": "30", "zh": "30"}]
+            saved.append(Scene(gaussians, 2, [Message("50")]))
             wait_until(lambda: shown.count(2) >= 2)
             visitor.view(position=[0.0, 0.5, -3.0])
             assert visitor.pictures(20.0, most=1) == 1
@@ -117,7 +118,7 @@ def test_the_page_does_not_depend_on_the_unit_of_the_scene(tmp_path):
                 box = [[-9.0 * factor] * 3, [0.0, 9.0 * factor, 9.0 * factor]]
                 visitor.display(crop=box)
                 (seen,) = viewer.session._visitors.values()
-                wait_until(lambda seen=seen: seen.pose and seen.display.crop)
+                wait_until(lambda seen=seen: seen.view and seen.display.crop)
                 visitor.send("key")
                 visitor.wait_for("key")
                 (tmp_path / "cameras.json").write_text(json.dumps(visitor.keys))
@@ -185,12 +186,15 @@ def test_the_page_of_a_finished_training_says_so(tmp_path):
         training = TrainingViewer(viewer, SampledPsnr([], viewer.background))
         training.after_step(8, 9, 0.5, gaussians)
         viewer.session.pause()
-        training.end(["Finished: 9 steps", "PSNR <20 dB"])
+        training.end([message("{gaussians:,} Gaussians", gaussians=9), Message("PSNR <20 dB")])
         assert not viewer.session.paused
         thread.start()
         with Visitor(viewer.url) as visitor:
             finished = visitor.wait_for("training")
-            assert finished["finished"] == ["Finished: 9 steps", "PSNR <20 dB"]
+            first, second = finished["finished"]
+            assert first["en"] == "9 Gaussians"
+            assert first["zh"] != first["en"]
+            assert second["en"] == second["zh"] == "PSNR <20 dB"
             assert not finished["paused"]
             assert visitor.wait_for("curves")["loss"] == [[8.0], [0.5]]
             visitor.view()

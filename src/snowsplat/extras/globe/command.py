@@ -8,12 +8,12 @@ from typing import Any
 
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.extras.globe.options import GlobeOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import message
 from snowsplat.util.settings import group, needed, setting
 
 
@@ -68,17 +68,13 @@ class Globe(JsonCommand):
                 observer=observer,
             )
         size = format_bytes(result.page.stat().st_size)
-        print(
-            message(
-                "{page}: {gaussians:,} Gaussians, {size}",
-                page=result.page,
-                gaussians=result.gaussians,
-                size=size,
-            )
+        print_message(
+            "{page}: {gaussians:,} Gaussians, {size}",
+            page=result.page,
+            gaussians=result.gaussians,
+            size=size,
         )
-        print(
-            message(
-                "to see it: open {page} in a browser; to share it: send this file", page=result.page
-            )
+        print_message(
+            "to see it: open {page} in a browser; to share it: send this file", page=result.page
         )
         return result

@@ -8,6 +8,7 @@ from typing import Any
 
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.extras.image.options import FitOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
@@ -76,31 +77,24 @@ class Image(JsonCommand):
                 observer=observer,
             )
         end = result.moments[-1]
-        print(
-            message(
-                "{output}: {gaussians:,} Gaussians, PSNR {psnr:.2f} dB, SSIM {ssim:.4f}, "
-                "{step:,} steps in {seconds}",
-                output=result.output,
-                gaussians=end.gaussians,
-                psnr=end.psnr,
-                ssim=end.ssim,
-                step=end.step,
-                seconds=duration(end.seconds),
-            )
+        print_message(
+            "{output}: {gaussians:,} Gaussians, PSNR {psnr:.2f} dB, SSIM {ssim:.4f}, "
+            "{step:,} steps in {seconds}",
+            output=result.output,
+            gaussians=end.gaussians,
+            psnr=end.psnr,
+            ssim=end.ssim,
+            step=end.step,
+            seconds=duration(end.seconds),
         )
-        print(
-            message(
-                "{output}: {file_bytes}, {bits_per_pixel:.2f} bits per pixel, PSNR "
-                "{file_psnr:.2f} dB",
-                output=result.output / "image.gimg",
-                file_bytes=format_bytes(result.file_bytes),
-                bits_per_pixel=result.bits_per_pixel,
-                file_psnr=result.file_psnr,
-            )
+        print_message(
+            "{output}: {file_bytes}, {bits_per_pixel:.2f} bits per pixel, PSNR {file_psnr:.2f} dB",
+            output=result.output / "image.gimg",
+            file_bytes=format_bytes(result.file_bytes),
+            bits_per_pixel=result.bits_per_pixel,
+            file_psnr=result.file_psnr,
         )
-        print(
-            message("to see it: open {output} in a browser", output=result.output / "report.html")
-        )
+        print_message("to see it: open {output} in a browser", output=result.output / "report.html")
         return {
             "output": result.output,
             "gaussians": end.gaussians,
@@ -120,8 +114,6 @@ class Image(JsonCommand):
         from snowsplat.extras.image.fit_image import decode_image
 
         width, height = decode_image(compact, target, self.size)
-        print(
-            message(
-                "{target}: {width} × {height} pixels", target=target, width=width, height=height
-            )
+        print_message(
+            "{target}: {width} × {height} pixels", target=target, width=width, height=height
         )

@@ -9,6 +9,7 @@ from typing import Any
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.print_message import print_message
 from snowsplat.extras.lift.options import DepthSource, LiftOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
@@ -97,52 +98,41 @@ class Lift(JsonCommand):
                 result = refine_photo(*what, self.refine, self.options, observer=observer, **given)
         if result.alignment is not None:
             fit = result.alignment
-            print(
-                message(
-                    "depth aligned to {points:,} points: median error {error:.1f}% of the "
-                    "disparity",
-                    points=fit.points,
-                    error=100 * fit.error,
-                )
+            print_message(
+                "depth aligned to {points:,} points: median error {error:.1f}% of the disparity",
+                points=fit.points,
+                error=100 * fit.error,
             )
         pixels, where = result.focal
         hint = message("; set it with --focal") if where == "assumed" else ""
-        print(
-            message(
-                "focal length: {pixels:.0f} pixels, {where}{hint}",
-                pixels=pixels,
-                where=where,
-                hint=hint,
-            )
+        print_message(
+            "focal length: {pixels:.0f} pixels, {where}{hint}",
+            pixels=pixels,
+            where=where,
+            hint=hint,
         )
-        print(
-            message(
-                "depth ({values_are}): {depths:.3g} to {depths2:.3g}",
-                values_are=self.source.values_are,
-                depths=result.depths[0],
-                depths2=result.depths[1],
-            )
+        print_message(
+            "depth ({values_are}): {depths:.3g} to {depths2:.3g}",
+            values_are=self.source.values_are,
+            depths=result.depths[0],
+            depths2=result.depths[1],
         )
-        print(
-            message(
-                "{scene}: {gaussians:,} Gaussians, PSNR {psnr:.2f} dB at the pose of the photo, "
-                "{seconds}",
-                scene=result.scene,
-                gaussians=result.gaussians,
-                psnr=result.psnr,
-                seconds=duration(result.seconds),
-            )
+        print_message(
+            "{scene}: {gaussians:,} Gaussians, PSNR {psnr:.2f} dB at the pose of the photo, "
+            "{seconds}",
+            scene=result.scene,
+            gaussians=result.gaussians,
+            psnr=result.psnr,
+            seconds=duration(result.seconds),
         )
         if result.evaluation is not None and result.evaluation.views:
             evaluation = result.evaluation
-            print(
-                message(
-                    "held-out photos of {size}: PSNR {psnr:.2f} dB",
-                    size=evaluation.size,
-                    psnr=evaluation.psnr,
-                )
+            print_message(
+                "held-out photos of {size}: PSNR {psnr:.2f} dB",
+                size=evaluation.size,
+                psnr=evaluation.psnr,
             )
         if result.swing is not None:
-            print(message("{swing}: the video", swing=result.swing))
+            print_message("{swing}: the video", swing=result.swing)
         print(see_and_share(self.output))
         return result

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -15,15 +15,19 @@ from snowsplat.viewer.http.listen import listen
 
 if TYPE_CHECKING:  # most trainings have no page; importing its server takes 0.1 s
     from snowsplat.viewer.live.training import TrainingViewer
-    from snowsplat.viewer.live.viewer import NetworkViewer, Scene
+    from snowsplat.viewer.live.viewer import NetworkViewer
 
 
 class LivePage:
     """A page at ``port`` of this machine; as a context manager, it closes the page at the end.
 
-    with LivePage() as page:
-        train("garden", "out/garden", page=page)
-        page.show_result()
+        with LivePage() as page:
+            train("garden", "out/garden", page=page)
+            page.show_result()
+
+    Attributes:
+        viewer: the page while it is open.
+        training: shows a training run there, if one has begun.
     """
 
     def __init__(
@@ -40,8 +44,8 @@ class LivePage:
         """
         self.port, self.host, self.allow_host = port, host or LOCAL_HOST, allow_host
         KnownHosts(self.host, allow_host)
-        self._viewer: NetworkViewer | None = None
-        self._training: TrainingViewer | None = None
+        self.viewer: NetworkViewer | None = None
+        self.training: TrainingViewer | None = None
         self._trainer: Trainer | None = None
         listen(self.host, port).close()
 
@@ -73,12 +77,14 @@ class LivePage:
             label=label,
             allow_host=self.allow_host,
         )
-        self._viewer = viewer
+        self.viewer = viewer
         observer.page_opened(viewer)
         return viewer
 
-    def open_training(self, trainer: Trainer, label: str, observer: Observer = SILENT) -> None:
-        """Open the page for a training run, as `open`; then call `after_step` after each step."""
+    def open_training(
+        self, trainer: Trainer, label: str, observer: Observer = SILENT
+    ) -> TrainingViewer:
+        """Open the page for a training run, as `open`; call `after_step` of the returned object."""
         from snowsplat.viewer.live.curves import SampledPsnr
         from snowsplat.viewer.live.training import TrainingViewer
 
@@ -86,60 +92,26 @@ class LivePage:
         background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
         viewer = self.open(trainer.dataset, background, label, observer)
         views = trainer.dataset.test or trainer.dataset.train
-        self._training = TrainingViewer(viewer, SampledPsnr(views, viewer.background))
+        self.training = TrainingViewer(viewer, SampledPsnr(views, viewer.background))
         self._trainer = trainer
-
-    def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
-        """Update the page after a step, and wait while a user has paused the training.
-
-        Returns the seconds for which the training was paused; see `TrainingViewer.after_step`.
-        """
-        assert self._training is not None
-        return self._training.after_step(step, steps, loss, gaussians)
+        return self.training
 
     @property
     def url(self) -> str:
-        assert self._viewer is not None
-        return self._viewer.url
-
-    @property
-    def others(self) -> list[str]:
-        """The addresses for other computers, if they differ."""
-        assert self._viewer is not None
-        return self._viewer.others
-
-    def resume(self) -> None:
-        """Resume the training if a user has paused it; may be called in any thread."""
-        if (viewer := self._viewer) is not None:
-            viewer.session.resume()
-
-    def end_training(self, about: list[str]) -> None:
-        """Show lines of text about the finished training run."""
-        assert self._training is not None
-        self._training.end(about)
-
-    @property
-    def has_trained(self) -> bool:
-        """Whether the page shows a training run."""
-        return self._training is not None
+        assert self.viewer is not None
+        return self.viewer.url
 
     def show_result(self, gaussians: Gaussians | None = None) -> None:
         """Show a scene until Ctrl-C: by default, that of the finished training run."""
-        assert self._training is not None
+        assert self.training is not None
         assert self._trainer is not None
         with suppress(KeyboardInterrupt):
             shown = self._trainer.gaussians if gaussians is None else gaussians
-            self._training.show(self._trainer.step, shown)
-
-    def show(self, scene: Callable[[], Scene]) -> None:
-        """Show the newest scene until Ctrl-C. ``scene`` returns it, and is called repeatedly."""
-        assert self._viewer is not None
-        with suppress(KeyboardInterrupt):
-            self._viewer.show_newest(scene)
+            self.training.show(self._trainer.step, shown)
 
     def close(self) -> None:
         """Close the page if it is open, and release the trainer."""
-        viewer, self._viewer = self._viewer, None
-        self._training = self._trainer = None
+        viewer, self.viewer = self.viewer, None
+        self.training = self._trainer = None
         if viewer is not None:
             viewer.close()

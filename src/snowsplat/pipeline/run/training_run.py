@@ -42,6 +42,7 @@ from snowsplat.training.settings.stored import config_to_json
 from snowsplat.training.step.finite import Diverged
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import Message, message
 from snowsplat.util.process import single_threaded
 from snowsplat.util.process_memory import peak_bytes
 
@@ -247,8 +248,8 @@ class TrainingRun:
             self._record_evaluation(step, self.together.evaluate())
         if self.evaluation is not None:
             self.out.write_metrics(step, "test", self.evaluation[1].as_json(), self._left_out())
-        if (page := self.request.page) is not None:
-            page.end_training(self._result_lines(len(gaussians), seconds))
+        if (page := self.request.page) is not None and page.training is not None:
+            page.training.end(self._result_lines(len(gaussians), seconds))
         self.history.write(self.out.history)
         reports = {part.name: part.report(self.trainer, gaussians) for part in self.trainer.parts}
         for each in reports.values():
@@ -278,12 +279,17 @@ class TrainingRun:
         self.observer.trained(result)
         return result
 
-    def _result_lines(self, gaussians: int, seconds: float) -> list[str]:
-        lines = [f"Finished: {self.trainer.step:,} steps in {duration(seconds)}"]
-        lines.append(f"{gaussians:,} Gaussians")
+    def _result_lines(self, gaussians: int, seconds: float) -> list[Message]:
+        steps, time = self.trainer.step, duration(seconds)
+        lines = [
+            message("Finished: {steps:,} steps in {time}", steps=steps, time=time),
+            message("{gaussians:,} Gaussians", gaussians=gaussians),
+        ]
         if self.evaluation is not None:
-            means = self.evaluation[1]
-            lines.append(f"PSNR {means.psnr:.2f} dB, {len(means.views)} held-out photos")
+            psnr, views = self.evaluation[1].psnr, len(self.evaluation[1].views)
+            lines.append(
+                message("PSNR {psnr:.2f} dB, {views} held-out photos", psnr=psnr, views=views)
+            )
         return lines
 
     def _verdict(self, gaussians: Gaussians, reports: Sequence[PartReport]) -> Verdict | None:

@@ -152,8 +152,8 @@ class Watchers:
             started = time.monotonic()
             self._open_or_close()
             waited = time.monotonic() - started
-        if self._page is not None:
-            waited += self._page.after_step(step, steps, loss, gaussians)
+        if self._page is not None and (training := self._page.training) is not None:
+            waited += training.after_step(step, steps, loss, gaussians)
         return waited
 
     def _open_or_close(self) -> None:
@@ -166,11 +166,13 @@ class Watchers:
                 self._close_page()
 
     def _answer(self, connection: socket.socket, request: PageRequest) -> None:
-        if self._page is None:
+        viewer = None if self._page is None else self._page.viewer
+        if viewer is None:
             try:
                 page = LivePage(request.port, request.host, request.allow_host)
                 try:
-                    page.open_training(self._trainer, self._output.absolute().name)
+                    label = self._output.absolute().name
+                    viewer = page.open_training(self._trainer, label).viewer
                 except BaseException:
                     page.close()
                     raise
@@ -178,7 +180,7 @@ class Watchers:
                 _send(connection, PageReply(error=str(error) or type(error).__name__))
                 return
             self._page = page
-        _send(connection, PageReply(self._page.url, self._page.others))
+        _send(connection, PageReply(viewer.url, viewer.others))
         self._watching.add(connection)
 
     def _close_page(self) -> None:
@@ -238,8 +240,9 @@ class Watchers:
             connection.close()
             self._watching.discard(connection)
             self._asking = [each for each in self._asking if each[0] is not connection]
-            if not self._watching and self._page is not None and not self._given:
-                self._page.resume()  # nobody else could
+            viewer = None if self._page is None else self._page.viewer
+            if not self._watching and viewer is not None and not self._given:
+                viewer.session.resume()  # nobody else could
                 self._deserted = True
 
 

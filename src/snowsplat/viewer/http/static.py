@@ -1,18 +1,96 @@
-"""An ASGI app that serves a table of files, with entity tags and ranges."""
+"""Files for browsers, in memory or on disk, and an ASGI app that serves a table of them."""
 
 from __future__ import annotations
 
 import asyncio
-import re
-from collections.abc import Mapping
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from urllib.parse import quote
 
 from starlette.datastructures import Headers
-from starlette.responses import Response
+from starlette.responses import FileResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from snowsplat.viewer.http.served_file import Served
+_BLOCK = 1 << 18  # bytes sent at once
+_TYPES = {
+    ".css": "text/css; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+    ".jpg": "image/jpeg",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".mp4": "video/mp4",
+    ".png": "image/png",
+    ".svg": "image/svg+xml",
+    ".txt": "text/plain; charset=utf-8",
+    ".webp": "image/webp",
+}
 
-_RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+
+@dataclass(frozen=True)
+class ServedFile:
+    """A file's bytes and its content type."""
+
+    content: bytes = field(repr=False)
+    type: str
+
+    @cached_property
+    def etag(self) -> str:
+        return f'"{hashlib.sha256(self.content).hexdigest()[:32]}"'
+
+    def response(self) -> Response:
+        return _InBlocks(self.content, headers={"Content-Type": self.type, "ETag": self.etag})
+
+
+@dataclass(frozen=True)
+class FileOnDisk:
+    """A file that is read when it is requested, also parts of it."""
+
+    path: Path
+    type: str
+
+    def response(self) -> Response:
+        """Raises: OSError: the file was removed."""
+        headers = {"Content-Type": self.type}
+        return _FromDisk(self.path, headers=headers, stat_result=os.stat(self.path))
+
+
+Served = ServedFile | FileOnDisk
+
+
+class _FromDisk(FileResponse):
+    chunk_size = _BLOCK
+
+
+class _InBlocks(Response):
+    """Sends its content in blocks: a slow client has received one before the connection times out.
+    Others are served in between."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        head = {"status": self.status_code, "headers": self.raw_headers}
+        await send({"type": "http.response.start", **head})
+        content = memoryview(self.body)
+        for at in range(0, len(content), _BLOCK):
+            block = content[at : at + _BLOCK]
+            await send({"type": "http.response.body", "body": block, "more_body": True})
+            await asyncio.sleep(0)
+        await send({"type": "http.response.body"})
+
+
+def content_type(file: Path) -> str:
+    """The content type of a file, by its suffix."""
+    return _TYPES.get(file.suffix, "application/octet-stream")
+
+
+def served(folder: Path, files: Iterable[Path]) -> dict[str, Served]:
+    """Files in a folder, by their quoted paths in it."""
+    return {
+        quote(file.relative_to(folder).as_posix()): FileOnDisk(file, content_type(file))
+        for file in files
+    }
 
 
 def static_app(files: Mapping[str, Served]) -> ASGIApp:
@@ -41,53 +119,13 @@ async def send_file(
 ) -> None:
     """Answer a GET or HEAD request with a file; without one, with 404. ``more``: headers."""
     if scope["method"] not in ("GET", "HEAD"):
-        refusal = Response(status_code=405, headers={"Allow": "GET, HEAD"})
-        return await refusal(scope, receive, send)
-    if file is None:
-        return await Response(status_code=404)(scope, receive, send)
-    headers = Headers(scope=scope)
-    common = {"ETag": file.etag, "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
-    common |= more or {}
-    if file.etag in headers.get("if-none-match", ""):
-        return await Response(status_code=304, headers=common)(scope, receive, send)
-    size = file.size
-    part = _range(headers, file)
-    if part is None:
-        status, start, end = 200, 0, size
-    elif part[0] < part[1]:
-        status, (start, end) = 206, part
-        common["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
+        response = Response(status_code=405, headers={"Allow": "GET, HEAD"})
+    elif file is None:
+        response = Response(status_code=404)
     else:
-        refused = {**common, "Content-Range": f"bytes */{size}"}
-        return await Response(status_code=416, headers=refused)(scope, receive, send)
-    common |= {"Content-Type": file.type, "Content-Length": str(end - start)}
-    raw = [(name.lower().encode(), value.encode("latin-1")) for name, value in common.items()]
-    await send({"type": "http.response.start", "status": status, "headers": raw})
-    if scope["method"] == "GET":
-        for block in file.blocks(start, end):
-            await send({"type": "http.response.body", "body": block, "more_body": True})
-            await asyncio.sleep(0)  # serves others, even if this client reads at once
-    await send({"type": "http.response.body"})
-
-
-def _range(headers: Headers, file: Served) -> tuple[int, int] | None:
-    """The first requested byte, and the byte after the last; None: the complete file.
-
-    A range outside of the file is empty. For multiple or malformed ranges, the complete file is
-    sent, as the protocol allows.
-    """
-    match = _RANGE.fullmatch(headers.get("range", "").replace(" ", ""))
-    if match is None or match[0] == "bytes=-":
-        return None
-    if headers.get("if-range", file.etag) != file.etag:
-        return None
-    size = file.size
-    # int() rejects numbers with thousands of digits; 19 digits are past the end anyway.
-    first, last = (int(digits[:19]) if digits else None for digits in match.groups())
-    if first is None:
-        return max(0, size - (last or 0)), size
-    if last is None:
-        return min(first, size), size
-    if last < first:
-        return None
-    return min(first, size), min(last + 1, size)
+        response = file.response()
+        response.headers.update({"Cache-Control": "private, no-cache", **(more or {})})
+        if response.headers["ETag"] in Headers(scope=scope).get("if-none-match", ""):
+            kept = {k: v for k, v in response.headers.items() if k not in ("content-length",)}
+            response = Response(status_code=304, headers=kept)
+    await response(scope, receive, send)

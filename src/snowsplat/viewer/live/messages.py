@@ -7,86 +7,12 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import torch
-
 from snowsplat.util.safe_json import from_json, parse_json
-from snowsplat.viewer.live.display import DisplaySettings, Mode, Pose
+from snowsplat.viewer.live.display import Display, View, within
 
 #: Maximum size of a message in bytes.
 MAX_BYTES = 4 << 10
-_MAX_SIDE = 16384  # pixels of a window
-_LONGEST = 320, 2560  # limits of the longer side of an image, in pixels
-_SCALE = 0.02, 1.0  # limits of the size of the Gaussians
 _SHARE = 0.05, 0.95  # limits of the share of the time
-# The norm of a quaternion is above this value and below its inverse.
-_SMALL = 1e-9
-_MAX_COORDINATE = 1e15  # computations in float32 are finite below it
-
-_Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class View:
-    """The camera of the page has moved, or its window has another size.
-
-    Attributes:
-        number: counted by the page; an image has the number of the view that it shows.
-        quat: wxyz of world_from_cam; x right, y down, z forward.
-        position: camera centre, world units.
-        fov: vertical field of view, radians.
-        width, height: of the window in pixels.
-        photo: index of the photo from whose position it looks, if there is one.
-    """
-
-    number: int
-    quat: tuple[float, float, float, float]
-    position: _Vector
-    fov: float
-    width: int
-    height: int
-    photo: int | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.number < 1 << 32:
-            raise ValueError("the number of a view is out of range")
-        if not _SMALL < math.hypot(*self.quat) < 1.0 / _SMALL:
-            raise ValueError("the quaternion of a view is not a rotation")
-        if not math.hypot(*self.position) < _MAX_COORDINATE or not self.fov > 0.0:
-            raise ValueError("the position or the field of view is out of range")
-        if not (1 <= self.width <= _MAX_SIDE and 1 <= self.height <= _MAX_SIDE):
-            raise ValueError("the size of a window is out of range")
-
-    def pose(self) -> Pose:
-        quat, position = (torch.tensor(v, dtype=torch.float64) for v in (self.quat, self.position))
-        return Pose(quat, position, self.fov, self.width, self.height, self.number)
-
-
-@dataclass(frozen=True)
-class Display:
-    """How the scene is displayed, see `DisplaySettings`; numbers are limited to their ranges.
-
-    ``longest``: pixels of the longer side of an image while the camera does not move.
-    """
-
-    mode: Mode
-    degree: int
-    scale: float
-    wipe: float
-    longest: int
-    crop: tuple[_Vector, _Vector] | None = None
-
-    @property
-    def longest_side(self) -> int:
-        return int(_within(self.longest, *_LONGEST))
-
-    def settings(self) -> DisplaySettings:
-        return DisplaySettings(
-            mode=self.mode,
-            sh_degree=int(_within(self.degree, 0, 3)),
-            scale=_within(self.scale, *_SCALE),
-            crop=self.crop,
-            wipe=_within(self.wipe, 0.0, 1.0),
-        )
 
 
 @dataclass(frozen=True)
@@ -112,12 +38,12 @@ class Training:
 
 @dataclass(frozen=True)
 class Share:
-    """The maximum share of the time for images while the scene trains, 0..1."""
+    """The maximum share of the time for images while the scene trains, limited to 0.05..0.95."""
 
     share: float
 
-    def limited(self) -> float:
-        return _within(self.share, *_SHARE)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "share", within(self.share, *_SHARE))
 
 
 @dataclass(frozen=True)
@@ -164,7 +90,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(each) for each in value]
     return value
-
-
-def _within(value: float, low: float, high: float) -> float:
-    return min(max(value, low), high)

@@ -16,7 +16,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.util.process import single_threaded
-from snowsplat.viewer.live.display import DisplaySettings, PhotoRectangle
+from snowsplat.viewer.live.display import Display, PhotoRectangle
 
 _DOT = 0.8  # pixels: standard deviation of the dot that represents a Gaussian as a point
 _ELLIPSOID_END = 1.5  # semi-axes of the ellipsoids, in standard deviations
@@ -60,7 +60,7 @@ class Photo:
 def draw(
     gaussians: Gaussians,
     camera: Camera,
-    display: DisplaySettings,
+    display: Display,
     background: Tensor | None = None,
     photo: Photo | None = None,
 ) -> np.ndarray:
@@ -79,7 +79,7 @@ def draw(
 def _in_mode(
     gaussians: Gaussians,
     camera: Camera,
-    display: DisplaySettings,
+    display: Display,
     background: Tensor | None,
     photo: Photo | None,
 ) -> Tensor:
@@ -89,7 +89,7 @@ def _in_mode(
     if display.scale != 1.0 and display.mode != "points":
         log_scales = gaussians.log_scales + math.log(display.scale)
         gaussians = dataclasses.replace(gaussians, log_scales=log_scales)
-    splats = project(gaussians, camera, display.sh_degree).without_empty_rows()
+    splats = project(gaussians, camera, display.degree).without_empty_rows()
     if display.crop is not None:
         splats = _cropped(splats, gaussians, display.crop)
     size = camera.width, camera.height
@@ -225,7 +225,7 @@ def _error(image: Tensor, photo: Photo) -> Tensor:
     return image
 
 
-def _with_photo(image: Tensor, photo: Photo, display: DisplaySettings) -> Tensor:
+def _with_photo(image: Tensor, photo: Photo, display: Display) -> Tensor:
     """Put the photo over the left part of its rectangle, up to ``display.wipe``.
 
     A white line divides it from the rendering. Outside of the rectangle, the rendering is darkened.

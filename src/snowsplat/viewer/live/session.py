@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from snowsplat.scene.camera import Camera
-from snowsplat.viewer.live.display import DisplaySettings, Pose, fit
+from snowsplat.viewer.live.display import Display, View, fit
 
 STILL = 0.2  # seconds without motion after which a camera counts as still
 # While the camera moves, images are made so small that rendering takes at most this many seconds.
@@ -49,8 +49,8 @@ class RenderRequest:
     width: int
     height: int
     version: int  # `Visitor.version` when the image was requested
-    pose: Pose
-    display: DisplaySettings
+    view: View
+    display: Display
     photo_view: PhotoView | None
 
 
@@ -58,11 +58,9 @@ class RenderRequest:
 class Visitor:
     """One browser that shows the page. Change its attributes through `Session.change`."""
 
-    pose: Pose | None = None
-    display: DisplaySettings = field(default_factory=DisplaySettings)
-    photo: int | None = None  # index of the photo at whose pose the browser is
-    photo_view: PhotoView | None = None  # that photo, as soon as it is read
-    longest: int = 1280  # pixels of the longer side of a full-size image
+    view: View | None = None
+    display: Display = field(default_factory=Display)
+    photo_view: PhotoView | None = None  # the photo of the view, as soon as it is read
     on_the_way: int = 0  # images that were rendered, and have not arrived at the browser
     version: int = 0  # incremented with each change of the attributes above
     changed: float = 0.0  # time of the last change
@@ -72,14 +70,19 @@ class Visitor:
     shown_scene: int = -1  # the number of the scene
     seconds_per_pixel: float = 0.0  # rendering time, averaged over the last images
 
+    @property
+    def photo(self) -> int | None:
+        """The index of the photo at whose pose the browser is."""
+        return None if self.view is None else self.view.photo
+
     def request(self, scene: int, now: float) -> RenderRequest | None:
         """The image that the browser needs at the time ``now``; None if it needs none.
 
         ``scene``: a number that changes when the scene changes.
         """
-        if self.pose is None or self.on_the_way >= _ON_THE_WAY:
+        if self.view is None or self.on_the_way >= _ON_THE_WAY:
             return None
-        full = fit(self.pose.width, self.pose.height, self.longest)
+        full = fit(self.view.width, self.view.height, self.display.longest)
         moving = now - self.changed < STILL
         kind: Literal["moving", "still", "idle"]
         if moving and self.shown_version != self.version:
@@ -91,7 +94,7 @@ class Visitor:
         else:
             return None
         return RenderRequest(
-            self, kind, *size, self.version, self.pose, self.display, self.photo_view
+            self, kind, *size, self.version, self.view, self.display, self.photo_view
         )
 
     def _moving_size(self, full: tuple[int, int]) -> tuple[int, int]:
@@ -150,12 +153,12 @@ class Session:
             visitor.changed = self._clock()
             self._notify()
 
-    def move(self, visitor: Visitor, pose: Pose, photo: int | None = None) -> None:
-        """Set the pose of a browser, and the photo at whose pose it is."""
+    def move(self, visitor: Visitor, view: View) -> None:
+        """Set the view of a browser."""
         kept = visitor.photo_view
-        if kept is not None and kept.index != photo:
+        if kept is not None and kept.index != view.photo:
             kept = None
-        self.change(visitor, pose=pose, photo=photo, photo_view=kept)
+        self.change(visitor, view=view, photo_view=kept)
 
     def show_photo(self, visitor: Visitor, photo_view: PhotoView) -> None:
         """Show a photo that was read, if the browser is still at its pose."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.interrupts import raise_deferred_interrupt
+from snowsplat.util.messages import Message
 from snowsplat.viewer.live.curves import Curve, SampledPsnr
 from snowsplat.viewer.live.viewer import NetworkViewer
 
@@ -106,11 +108,11 @@ class TrainingViewer:
             self._rate = keep * self._rate + (1.0 - keep) * rate
         return self._rate
 
-    def end(self, about: list[str]) -> None:
+    def end(self, about: Sequence[Message]) -> None:
         """The training has finished: show lines of text about it instead of its controls."""
         self._session.training = False
         self._session.resume()
-        self._tell(finished=about)
+        self._tell(finished=[line.in_all_languages() for line in about])
         self._tell_curves()
 
     def show(self, step: int, gaussians: Gaussians) -> None:

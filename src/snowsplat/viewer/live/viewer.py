@@ -8,7 +8,7 @@ import itertools
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,20 +20,19 @@ from snowsplat.data import Dataset
 from snowsplat.scene.camera_json import entries_of
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.trajectory.focus import focus_of, up_of, viewing_distance
+from snowsplat.util import messages
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.http.served_file import FileOnDisk, Served, ServedFile, content_type
 from snowsplat.viewer.http.server import WebServer
-from snowsplat.viewer.http.static import static_app
+from snowsplat.viewer.http.static import FileOnDisk, Served, ServedFile, content_type, static_app
 from snowsplat.viewer.live.browser import Browser
+from snowsplat.viewer.live.display import Display, View
 from snowsplat.viewer.live.messages import (
-    Display,
     Key,
     Message,
     Share,
     Shown,
     Thumbnails,
     Training,
-    View,
     to_json,
 )
 from snowsplat.viewer.live.page_files import FILES, INDEX, POLICY
@@ -63,7 +62,7 @@ class Scene:
 
     gaussians: Gaussians | None
     number: int
-    about: list[str]
+    about: Sequence[messages.Message]
 
 
 class NetworkViewer:
@@ -205,25 +204,22 @@ class NetworkViewer:
             self._photos.begin(lambda: self.server.call(self._wake))
             browser.want_thumbnails(message.count)
         elif isinstance(message, Display):
-            longest = message.longest_side
-            session.change(visitor, display=message.settings(), longest=longest)
-        elif isinstance(message, Key) and visitor.pose is not None:
-            pose = visitor.pose
-            camera = pose.camera(pose.width, pose.height, self._near)
+            session.change(visitor, display=message)
+        elif isinstance(message, Key) and (view := visitor.view) is not None:
+            camera = view.camera(view.width, view.height, self._near)
             browser.tell_key(entries_of([("", camera)])[0])
         elif isinstance(message, Training):
             {"pause": session.pause, "resume": session.resume, "step": session.step}[message.do]()
             self._tell_control()
         elif isinstance(message, Share):
-            session.share = message.limited()
+            session.share = message.share
             self._tell_control()
 
     def _move(self, browser: Browser, view: View) -> None:
-        photo = view.photo
-        if photo is not None and not 0 <= photo < len(self._photos.views):
-            photo = None
-        self.session.move(browser.visitor, view.pose(), photo)
-        if photo is not None and (browser.reading is None or browser.reading.done()):
+        if view.photo is not None and not 0 <= view.photo < len(self._photos.views):
+            view = replace(view, photo=None)
+        self.session.move(browser.visitor, view)
+        if view.photo is not None and (browser.reading is None or browser.reading.done()):
             browser.reading = asyncio.create_task(self._read_photos(browser))
 
     async def _read_photos(self, browser: Browser) -> None:
@@ -236,7 +232,8 @@ class NetworkViewer:
             try:
                 self.session.show_photo(visitor, await self._photos.read(tried))
             except UserError as error:
-                message = {"type": "photo", "index": tried, "error": str(error)}
+                why = error.message.in_all_languages()
+                message = {"type": "photo", "index": tried, "error": why}
                 browser.tell("photo", to_json(message))
 
     def _send(self, request: RenderRequest, image: np.ndarray, drawing: float) -> None:
@@ -245,7 +242,7 @@ class NetworkViewer:
         try:
             if browser is not None:  # None: the browser has disconnected
                 with self._time_limit.uncounted():
-                    browser.show(jpeg(image, _QUALITY[request.kind]), request.pose.number)
+                    browser.show(jpeg(image, _QUALITY[request.kind]), request.view.number)
         except Exception:
             self.session.arrived(request.visitor, 1)
             raise
@@ -277,7 +274,7 @@ class NetworkViewer:
     def _draw(self, request: RenderRequest, gaussians: Gaussians) -> np.ndarray:
         width, height, photo = request.width, request.height, None
         if request.photo_view is None:
-            camera = request.pose.camera(width, height, self._near)
+            camera = request.view.camera(width, height, self._near)
         else:
             photo = fitted_photo(request.photo_view, width, height)
             camera = photo.placed.camera(request.photo_view.camera, width, height)
@@ -295,7 +292,8 @@ class NetworkViewer:
                 before, scene = scene, newest()
                 checked = time.monotonic()
                 if scene != before:
-                    self.tell({"type": "about", "lines": scene.about})
+                    lines = [line.in_all_languages() for line in scene.about]
+                    self.tell({"type": "about", "lines": lines})
             assert scene is not None
             if scene.gaussians is None or not self.serve(
                 scene.gaussians, scene.number, training=False

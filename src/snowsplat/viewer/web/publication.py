@@ -17,7 +17,7 @@ from snowsplat.formats.sog import write_sog
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.files import atomic_path, write_text
-from snowsplat.viewer.http.served_file import Served, served
+from snowsplat.viewer.http.static import Served, served
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import PICTURES, ReadyScene
 from snowsplat.viewer.web.viewer_page import asset, content_policy, page

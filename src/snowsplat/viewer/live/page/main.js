@@ -5,7 +5,7 @@ import { DisplayPanel } from "./display.js";
 import { byId, isDark, showLines } from "./elements.js";
 import { Frustums } from "./frustums.js";
 import { listen } from "./input.js";
-import { switchLanguage, text, translate } from "./texts.js";
+import { inLanguage, switchLanguage, text, translate } from "./texts.js";
 import { TrainingPanel } from "./training.js";
 import { VideoPanel } from "./video.js";
 
@@ -22,6 +22,8 @@ let camera;
 let frustums;
 /** @type {string} a name in `texts.js`; empty if all is well */
 let notice = "connecting";
+/** @type {Record<string, string>[]} about the scene, in each language */
+let about = [];
 
 // Sending. The newest state replaces one that waits; an image has the number of its view.
 
@@ -97,10 +99,10 @@ const connection = new Connection({
         else if (type === "training") training.show(message);
         else if (type === "curves") training.showCurves(message);
         else if (type === "about") {
-            byId("about").hidden = false;
-            showLines(byId("lines"), message.lines);
+            about = message.lines;
+            showAbout();
         } else if (type === "key") video.add(message.entry);
-        else if (type === "photo" && camera?.photo === message.index) byId("where").textContent = message.error;
+        else if (type === "photo" && camera?.photo === message.index) byId("where").textContent = inLanguage(message.error);
     },
     image: async ({ number: arrived, view, blob }) => {
         newest = arrived;
@@ -247,6 +249,10 @@ matchMedia("(prefers-color-scheme: light)").addEventListener("change", showTheme
 // A list that was chosen with the mouse returns the keyboard to the scene.
 byId("mode").addEventListener("change", () => byId("mode").matches(":focus-visible") || stage.focus());
 
+const showAbout = () => {
+    byId("about").hidden = !about.length;
+    showLines(byId("lines"), about.map(inLanguage));
+};
 const showTexts = () => {
     translate();
     byId("language").textContent = text("other");
@@ -255,6 +261,7 @@ const showTexts = () => {
     display.describe();
     video.show();
     describePhoto();
+    showAbout();
 };
 showTexts();
 showTheme();

@@ -171,6 +171,9 @@ let language = wanted.toLowerCase().startsWith("zh") ? "zh" : "en";
 /** The text of this name. @param {string} name @param {Record<string, string | number>} [values] */
 export const text = (name, values = {}) => TEXTS[language][name].replace(/\{(\w+)\}/g, (_, key) => String(values[key]));
 
+/** A text of the server, which has it in each language. @param {Record<string, string>} told */
+export const inLanguage = told => told[language];
+
 /** A number with the separators of English, which Chinese uses, too. @param {number} value @param {number} [digits] */
 export const number = (value, digits = 0) =>
     value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });

@@ -1,7 +1,7 @@
 // The part of the panel about the training: its state, its buttons, its curves.
 import { Plot } from "./curves.js";
 import { byId, showLines, showValue } from "./elements.js";
-import { number, text } from "./texts.js";
+import { inLanguage, number, text } from "./texts.js";
 
 /**
  * @typedef {object} Training the message of the server
@@ -13,7 +13,7 @@ import { number, text } from "./texts.js";
  * @property {number} [gaussians]
  * @property {number | null} [loss]
  * @property {number | null} [psnr]
- * @property {string[]} [finished] lines about the result
+ * @property {Record<string, string>[]} [finished] lines about the result, in each language
  */
 
 export class TrainingPanel {
@@ -53,7 +53,7 @@ export class TrainingPanel {
         byId("progress").value = told.finished ? 1 : (told.step ?? 0) / (told.steps ?? 1);
         if (document.activeElement !== byId("share")) byId("share").value = Math.round(100 * told.share);
         showValue(byId("share"));
-        showLines(byId("status"), told.finished ?? this.lines(told));
+        showLines(byId("status"), told.finished?.map(inLanguage) ?? this.lines(told));
         this.loss.show(text("loss"));
         this.psnr.show(text("psnr"));
     }
