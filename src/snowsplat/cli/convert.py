@@ -14,6 +14,7 @@ from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.convert import Edits
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.settings import argument, group, setting, switch
 
 
@@ -118,13 +119,15 @@ class Convert(JsonCommand):
                 observer=observer,
             )
         size = format.size(target)
-        written = f"{format_bytes(size)} of {format.name}"
         print_message(
-            "{target}: {written}; lost in this format: {loses}",
+            "{target}: {size} of {format}; lost in this format: {loses}",
             target=target,
-            written=written,
+            size=format_bytes(size),
+            format=format.name,
             loses=format.loses,
         )
-        page = format.name == "HTML"
-        print(f"to see it: open {target} in a browser" if page else see_and_share(target))
+        to_see = see_and_share(target)
+        if format.name == "HTML":
+            to_see = message("to see it: open {target} in a browser", target=target)
+        print_message(to_see)
         return {"file": target, "bytes": size, "format": format.name, "lost": format.loses}

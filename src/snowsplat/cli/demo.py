@@ -14,6 +14,7 @@ from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.print_message import print_message
 from snowsplat.cli.view import View
 from snowsplat.util.flags import command_line, with_flags, words
+from snowsplat.util.messages import message
 from snowsplat.util.settings import setting, switch
 
 if TYPE_CHECKING:
@@ -64,11 +65,11 @@ class Demo(Command):
         print_summary(result.made)
         _print_errors(result.errors)
         if not result.accurate:
-            print(
+            wrong = message(
                 "snowsplat: the camera poses are wrong; repeat the demo in a new folder while no "
-                "other programs run",
-                file=sys.stderr,
+                "other programs run"
             )
+            print(wrong, file=sys.stderr)
             return Exit(1)
         scene = result.made.project.path
         if not self.open:

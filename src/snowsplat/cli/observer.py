@@ -104,7 +104,7 @@ class TerminalObserver(Observer):
     def page_opened(self, page: Page) -> None:
         print_message("watch it in a browser: {url}", url=page.url)
         for line in for_other_computers(page.url, page.others):
-            print(line, flush=True)
+            print_message(line)
 
 
 class WatchObserver(TerminalObserver):
@@ -112,4 +112,4 @@ class WatchObserver(TerminalObserver):
 
     def page_opened(self, page: Page) -> None:
         super().page_opened(page)
-        print("Ctrl-C ends it", flush=True)
+        print_message("Ctrl-C ends it")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from snowsplat.cli.pages import show, wait
 from snowsplat.util.errors import UserError
 from snowsplat.util.flags import words
+from snowsplat.util.messages import message
 from snowsplat.util.settings import Settings, same, setting, switch
 from snowsplat.viewer.hosts import LOCAL_HOST
 
@@ -80,6 +81,6 @@ class PageServer(Settings):
 
     def serve(self, server: WebServer) -> None:
         """Show a page, see `show`, and wait for Ctrl-C."""
-        url, others = server.url, server.others
-        show("open this in a browser, Ctrl-C ends it", url, others, not self.no_browser)
+        how = message("open this in a browser, Ctrl-C ends it")
+        show(how, server.url, server.others, not self.no_browser)
         wait()

@@ -19,18 +19,19 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from snowsplat.cli.print_message import print_message
+from snowsplat.util.messages import Message, message
 from snowsplat.viewer.hosts import LOCAL_HOST
 
 _OPENING_SECONDS = 5.0  # in which a browser gets its address
 
 
-def for_other_computers(url: str, others: Sequence[str]) -> list[str]:
+def for_other_computers(url: str, others: Sequence[str]) -> list[Message]:
     """Lines that say how other computers open a page: at its other addresses or, if it is only for
     this computer and this shell is a remote one, through a forwarded port."""
     here = urlsplit(url)
     if here.hostname == LOCAL_HOST and not others and over_ssh():
-        return [f"from your computer: {_forwarding(here.port)}"]
-    return [f"from other computers: {other}" for other in others]
+        return [message("from your computer: {command}", command=_forwarding(here.port))]
+    return [message("from other computers: {url}", url=other) for other in others]
 
 
 def over_ssh() -> bool:
@@ -55,7 +56,7 @@ def _forwarding(port: int | None) -> str:
 
 
 def show(
-    how: str, url: str, others: Sequence[str], browser: bool, opener: Path | None = None
+    how: Message, url: str, others: Sequence[str], browser: bool, opener: Path | None = None
 ) -> None:
     """Print the addresses of a page, and open it if there is a ``browser`` and a screen.
 
@@ -63,7 +64,7 @@ def show(
     """
     print_message("{how}: {url}", how=how, url=url)
     for line in for_other_computers(url, others):
-        print(line, flush=True)
+        print_message(line)
     if browser and has_screen():
         import webbrowser
 

@@ -12,6 +12,7 @@ from snowsplat.cli.page_flags import PageServer
 from snowsplat.cli.pages import opener_of, show
 from snowsplat.cli.print_message import print_message
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.settings import argument, group
 from snowsplat.viewer.hosts import ANY_HOST, LOCAL_HOST, KnownHosts, is_loopback
 
@@ -95,7 +96,7 @@ class Studio(Command):
             )
         print_message("scenes are kept in {folder}", folder=library.folder)
         show(
-            "a studio has them open already",
+            message("a studio has them open already"),
             address.url,
             address.others,
             not self.server.no_browser,

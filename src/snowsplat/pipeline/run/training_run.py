@@ -111,16 +111,15 @@ class TrainingRun:
                 self.out.discard()
                 if self.trainer.step == 0:
                     raise
-                raise TrainingStopped(
-                    f"stopped within a step, which is not saved; {self._last_checkpoint_as_text()}",
-                    None,
-                ) from None
+                last = self._last_checkpoint_as_text()
+                stopped = message("stopped within a step, which is not saved; {last}", last=last)
+                raise TrainingStopped(str(stopped), None) from None
         except Diverged as error:
             self.out.discard()
             raise UserError(
-                "{error}; {last_checkpoint_as_text}",
+                "{error}; {last}",
                 error=error,
-                last_checkpoint_as_text=self._last_checkpoint_as_text(),
+                last=self._last_checkpoint_as_text(),
             ) from None
         except BaseException:
             self.out.discard()
@@ -132,7 +131,8 @@ class TrainingRun:
         scene = self._save_scene()
         self._save_checkpoint()
         self.together.proceed()
-        raise TrainingStopped(f"stopped after step {self.trainer.step}: {scene}", scene)
+        stopped = message("stopped after step {step}: {scene}", step=self.trainer.step, scene=scene)
+        raise TrainingStopped(str(stopped), scene)
 
     def _record(self, progress: Progress) -> None:
         # If there are metrics, the time of the step includes an evaluation and is not counted.
@@ -219,15 +219,17 @@ class TrainingRun:
         self.last_checkpoint = time.monotonic()
         return path
 
-    def _last_checkpoint_as_text(self) -> str:
+    def _last_checkpoint_as_text(self) -> Message:
         """Which checkpoint can be used, as the end of an error message."""
         saved = checkpoint.files(self.out.checkpoints)
         if not saved:
-            return "there is no checkpoint yet"
+            return message("there is no checkpoint yet")
         step, path = saved[0]
-        return (
-            f"the last good checkpoint is {path}; "
-            f"use `resume` with `iterations` {step} to save its scene"
+        return message(
+            "the last good checkpoint is {path}; use `resume` with `iterations` {step} to save its "
+            "scene",
+            path=path,
+            step=step,
         )
 
     def _record_evaluation(self, step: int, evaluation: Evaluation) -> None:
