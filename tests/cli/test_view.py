@@ -124,7 +124,7 @@ def test_a_user_without_a_name_can_forward_a_port(monkeypatch):
     monkeypatch.setattr("getpass.getuser", unknown)
     monkeypatch.setenv("SSH_CONNECTION", "1")
     (line,) = for_other_computers("http://127.0.0.1:81/", [])
-    assert line.startswith("from your computer: ssh -L 81:127.0.0.1:81 USER@")
+    assert str(line).startswith("from your computer: ssh -L 81:127.0.0.1:81 USER@")
 
 
 def test_with_a_public_host_it_prints_the_address_for_other_computers(served, out):
