@@ -6,12 +6,14 @@ import os
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from snowsplat.data import load_dataset
 from snowsplat.data.colmap.model import read_model, write_model
 from snowsplat.data.dataset import Points
 from snowsplat.data.files.photo_files import photos_below
 from snowsplat.data.load import _are_placeholder
+from snowsplat.data.photos.decode import read_header
 from snowsplat.data.points_ply import write_points
 from snowsplat.util.errors import UserError
 
@@ -120,3 +122,26 @@ def test_points_without_an_error(dataset_copy):
     lines = [line.split() for line in path.read_text().splitlines() if line[:1] != "#"]
     path.write_text("".join(" ".join(line[:7]) + "\n" for line in lines))
     assert torch.equal(load_dataset(folder).points.xyz, whole.xyz)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+def test_a_photo_whose_data_end_early_is_left_out(dataset_copy, caplog, suffix):
+    """A copy that was interrupted is seen when the dataset is read, not while it is trained."""
+    folder = dataset_copy("colmap-bin")
+    every = len(load_dataset(folder, hold_out=None).train)
+    for path in (folder / "images").iterdir():
+        Image.open(path).convert("RGB").save(path.with_suffix(f".{suffix}"))
+        if path.suffix != f".{suffix}":
+            path.unlink()
+    cut = sorted((folder / "images").iterdir())[1]
+    cut.write_bytes(cut.read_bytes()[:-40])
+    assert len(load_dataset(folder, hold_out=None).train) == every - 1
+    assert f"1 of {every} photos are left out: {cut.stem}" in caplog.text
+
+
+def test_bytes_after_a_photo_are_no_damage(tmp_path):
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (30, 20), (9, 200, 30)).save(path)
+    with open(path, "ab") as file:
+        file.write(bytes(9000))
+    assert read_header(path).width == 30

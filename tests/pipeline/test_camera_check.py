@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import logging
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from snowsplat.cli.main import parse
+from snowsplat.data import load_dataset, read_dataset
+from snowsplat.data.judge.finding import Finding
 from snowsplat.pipeline.describe import describe
 from snowsplat.pipeline.options.train import TrainOptions
+from snowsplat.pipeline.run import camera_check
 from snowsplat.pipeline.train import train
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
@@ -54,3 +59,22 @@ def test_info(wrong: Path, tmp_path: Path) -> None:
 
 def test_flag() -> None:
     assert parse(["train", "garden", "-o", "out", "--trust-cameras"]).options.trust_cameras
+
+
+def test_photos_whose_poses_are_contradicted_are_left_out(tmp_path, monkeypatch, caplog) -> None:
+    """Of the training, and of what reads the dataset after it."""
+    dataset = write_toy_dataset(tmp_path / "toy", "colmap-bin", 9, 48, 36)
+    names = ("view_03.png", "view_08.png")
+    found = Finding("poses", "the poses of two are wrong", photos=names)
+    everything = {v.name for v in load_dataset(dataset, hold_out=None).train}
+    assert {*names} < everything
+    monkeypatch.setattr(camera_check, "judge", lambda dataset: [found])
+    options = TrainOptions(settings=SHORT, hold_out=8)
+    result = train(dataset, tmp_path / "out", options)
+    assert [(each.photo, each.stage) for each in result.left_out] == [(n, "poses") for n in names]
+    folder = TrainingFolder(tmp_path / "out")
+    assert {each.photo for each in folder.left_out()} == {*names}
+    again = read_dataset(folder.settings()[0])
+    assert {view.name for view in [*again.train, *again.test]} == everything - {*names}
+    trusted = train(dataset, tmp_path / "trusted", replace(options, trust_cameras=True))
+    assert trusted.left_out == ()

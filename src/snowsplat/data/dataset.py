@@ -94,6 +94,12 @@ class View:
     depth_confidence: Path | None = None  # a map of the same size; 0: the depth is not used
     normals: Path | None = None  # a normal map of the image, of any size; see `read_normal_file`
 
+    @property
+    def photo(self) -> str:
+        """The name of the photo; it may have several views."""
+        part = self.image.view
+        return self.name.removesuffix(f"/{part.name}") if part and part.name else self.name
+
 
 @dataclass
 class Dataset:

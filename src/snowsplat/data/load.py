@@ -112,6 +112,11 @@ class DatasetFiles:
     origin: Origin
     metres_per_unit: float | None
 
+    def without(self, names: Sequence[str]) -> DatasetFiles:
+        """The same files without some images; the others stay held out or not."""
+        kept = [(image, size) for image, size in self.images if image.name not in names]
+        return replace(self, images=kept)
+
     def dataset(self, resolution: int) -> Dataset:
         """The dataset at a resolution, see `load_dataset`; reads no file.
 
@@ -179,7 +184,7 @@ def read_files(settings: DatasetSettings) -> DatasetFiles:
     sized = with_sizes(root, [image for image in posed if first[image.name] is image])
     posed = [image for image, _ in sized]
     _warn_of_cropped(posed)
-    return DatasetFiles(
+    files = DatasetFiles(
         root=root,
         images=sized,
         test_names=held_out_names(
@@ -191,6 +196,7 @@ def read_files(settings: DatasetSettings) -> DatasetFiles:
         origin=origin,
         metres_per_unit=found.metres_per_unit,
     )
+    return files.without(settings.left_out or [])
 
 
 def _are_placeholder(points: Points) -> bool:

@@ -175,7 +175,11 @@ class _Job:
         config = options.configuration()
         files = read_files(settings)
         dataset = files.dataset(settings.resolution)
-        self.doubts = check_cameras(dataset, settings.path, trusted=options.trust_cameras)
+        trusted = options.trust_cameras
+        self.doubts, wrong = check_cameras(dataset, settings.path, trusted=trusted)
+        if wrong:
+            settings, files = replace(settings, left_out=wrong), files.without(wrong)
+            dataset = files.dataset(settings.resolution)
         check_test_photos(dataset.test)
         budget, plan = self._budget(), None
         if budget is not None:
@@ -217,7 +221,7 @@ class _Job:
         config = _resumed_config(options, start, meta)
         dataset = read_dataset(settings)
         # The first run has refused impossible cameras, or not.
-        self.doubts = check_cameras(dataset, settings.path, trusted=True)
+        self.doubts, _ = check_cameras(dataset, settings.path, trusted=True)
         self._compare_photos(dataset, settings.path, meta)
         memory = plan_memory(
             dataset, config, self.device, budget=options.memory, present=_gaussians_in(start)

@@ -58,12 +58,17 @@ Color = tuple[float, float, float]
 DATASET, SCENE = "dataset", "scene"
 #: Why the training has left a photo out.
 UNEXPLAINED = message("the scene does not explain it")
+#: Why a training leaves out a photo before its first step.
+CONTRADICTED = message("the matches with other photos contradict its pose")
 _SCENE = re.compile(r"iteration_(\d+)")
 
 
 @dataclass(frozen=True)
 class DatasetSettings:
-    """How the dataset of a training run is read: the arguments of `snowsplat.load_dataset`."""
+    """How the dataset of a training run is read: the arguments of `snowsplat.load_dataset`.
+
+    ``left_out``: names of photos that are not used, because the matches contradict their poses.
+    """
 
     path: str
     images: str = "images"
@@ -71,6 +76,7 @@ class DatasetSettings:
     hold_out: int | None = None
     first_held_out: int = 0
     test_list: str | list[str] | None = None
+    left_out: list[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -372,10 +378,14 @@ class TrainingFolder:
             return {}
 
     def left_out(self) -> list[LeftOut]:
-        """The training photos that the scene does not explain."""
+        """The photos whose poses are wrong, and those that the scene does not explain."""
         names = self.read_metrics().get("left_out")
-        found = names if isinstance(names, list) else []
-        return [LeftOut(str(name), "training", UNEXPLAINED) for name in found]
+        found = [str(name) for name in names] if isinstance(names, list) else []
+        wrong = (self.settings()[0].left_out or []) if self.is_training() else []
+        return [
+            *(LeftOut(name, "poses", CONTRADICTED) for name in wrong),
+            *(LeftOut(name, "training", UNEXPLAINED) for name in found if name not in wrong),
+        ]
 
     def exposures(self) -> dict[str, list[float]]:
         """The exposure of each training photo in EV, by channel; empty if no gains were learnt.

@@ -15,8 +15,10 @@ class Finding:
             to do, after a semicolon.
         impossible: no real camera is like this, or the evidence is overwhelming. False: in doubt;
             the data may be unusual but right.
+        photos: the views whose poses are wrong, if those of the others are right.
     """
 
     about: str
     text: str
     impossible: bool = False
+    photos: tuple[str, ...] = ()

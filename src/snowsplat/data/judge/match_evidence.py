@@ -29,12 +29,16 @@ _PARALLAX = 0.01
 
 @dataclass(frozen=True)
 class Pair:
-    """Two views of the sample, and matches (N, 2) relative to the sizes of their photos."""
+    """Two views of the sample, and matches (N, 2) relative to the sizes of their photos.
+
+    ``moved``: the share of all their matches that are not at the same place in both photos.
+    """
 
     a: int
     b: int
     in_a: np.ndarray
     in_b: np.ndarray
+    moved: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -80,14 +84,16 @@ class MatchEvidence:
         self.pairs += self._match_pairs(same_group=False)
 
     def _match_pairs(self, *, same_group: bool) -> list[Pair]:
-        groups = self._sample.groups
+        groups, near = self._sample.groups, self._sample.near
         candidates = [
             Pair(a, b, *_matches(self._features[a], self._features[b]))
             for a, b in combinations(range(len(groups)), 2)
-            if (groups[a] == groups[b]) == same_group
+            if (groups[a] == groups[b] or (a, b) in near) == same_group
         ]
         candidates.sort(key=lambda pair: -len(pair.in_a))
-        rigid = (_rigid(pair, self._sample) for pair in candidates[:_MOST_PAIRS])
+        chosen = candidates[:_MOST_PAIRS]
+        chosen += [pair for pair in candidates[_MOST_PAIRS:] if (pair.a, pair.b) in near]
+        rigid = (_rigid(pair, self._sample) for pair in chosen)
         return [pair for pair in rigid if len(pair.in_a) >= _FEWEST_MATCHES]
 
     def fit(self, rig: Rig) -> Fit:
@@ -143,7 +149,8 @@ def _rigid(pair: Pair, sample: PhotoSample) -> Pair:
             in_a * sizes[0], in_b * sizes[1], cv2.FM_RANSAC, _RANSAC_PIXELS, 0.99, 500
         )
         agree = agree if mask is None else mask[:, 0] > 0
-    return Pair(pair.a, pair.b, in_a[agree], in_b[agree])
+    share = float(moved.mean()) if len(moved) else 0.0
+    return Pair(pair.a, pair.b, in_a[agree], in_b[agree], share)
 
 
 def _distances(pair: Pair, rig: Rig) -> np.ndarray:

@@ -19,8 +19,11 @@ SIDE = 320
 # Views spread over the dataset in the order of names. Each brings two neighbours: the next one by
 # name, and the nearest one by pose. If the poses are right, these see the same things.
 _ANCHORS = 8
-# Views with the pose of another one that are added, and views before and after each of them.
-_REPEATED, _AROUND = 4, 2
+# Views whose pose may be wrong that are added: those with the pose of another one, and those far
+# from the line between their neighbours by name; and the views around each of them.
+_REPEATED, _ASTRAY, _AROUND = 4, 4, 2
+# How many times the distance between the neighbours the way over a view is, to be astray.
+_DETOUR = 4.0
 
 
 @dataclass(frozen=True)
@@ -31,30 +34,34 @@ class PhotoSample:
         views: their indices in the dataset.
         groups: (N,) the number of the anchor that a view belongs to; views of one group may look
             alike.
+        near: pairs of views of the sample, one of which may have a wrong pose.
         photos: (4, h, w) uint8 RGBA each. Masks are not applied: what is moving in a few photos
             misleads no witness, and a mask may be wrong.
     """
 
     views: list[int]
     groups: np.ndarray
+    near: set[tuple[int, int]]
     photos: list[np.ndarray]
 
     @classmethod
     def of(cls, views: Sequence[View], rig: Rig) -> PhotoSample:
         """Decode a sample of the photos. Photos that cannot be decoded are left out."""
-        group = _choose_views(rig)
+        group, near = _choose_views(rig)
         workers = min(4, os.cpu_count() or 1)
         with ThreadPoolExecutor(workers, thread_name_prefix="snowsplat-judge") as pool:
             decoded = list(pool.map(lambda i: _photo(views[i]), group))
         kept = {i: photo for i, photo in zip(group, decoded, strict=True) if photo is not None}
-        return cls(list(kept), np.array([group[i] for i in kept]), list(kept.values()))
+        place = {view: number for number, view in enumerate(kept)}
+        pairs = {(place[a], place[b]) for a, b in near if a in place and b in place}
+        return cls(list(kept), np.array([group[i] for i in kept]), pairs, list(kept.values()))
 
     def __len__(self) -> int:
         return len(self.views)
 
 
-def _choose_views(rig: Rig) -> dict[int, int]:
-    """The group of each view of the sample, by its index; sorted."""
+def _choose_views(rig: Rig) -> tuple[dict[int, int], set[tuple[int, int]]]:
+    """The group of each view of the sample, by its index; sorted. Pairs of views as in ``near``."""
     count = len(rig)
     anchors = np.unique(np.linspace(0, count - 1, min(count, _ANCHORS)).round().astype(int))
     positions = rig.positions
@@ -64,14 +71,28 @@ def _choose_views(rig: Rig) -> dict[int, int]:
         distance[distance == 0] = np.inf
         for neighbour in (min(anchor + 1, count - 1), distance.argmin()):
             group.setdefault(int(neighbour), number)
-    # Trackers that were lost repeat a pose. Each such view is compared with those around it.
+    near: set[tuple[int, int]] = set()
+    for number, view in enumerate(_suspects(rig), len(anchors)):
+        around = range(max(0, view - _AROUND), min(count, view + _AROUND + 1))
+        for other in around:
+            group.setdefault(other, number)
+        near |= {(min(view, other), max(view, other)) for other in around if other != view}
+    return dict(sorted(group.items())), near
+
+
+def _suspects(rig: Rig) -> list[int]:
+    """Views whose pose may be wrong. Trackers that were lost repeat a pose, or jump."""
+    count, positions = len(rig), rig.positions
     poses = np.concatenate([rig.rotation.reshape(count, 9), rig.translation], 1)
     _, which, often = np.unique(poses, axis=0, return_inverse=True, return_counts=True)
-    repeated = np.flatnonzero(often[which.reshape(-1)] > 1)
-    for number, view in enumerate(repeated[:_REPEATED], len(anchors)):
-        for near in range(max(0, view - _AROUND), min(count, view + _AROUND + 1)):
-            group.setdefault(near, number)
-    return dict(sorted(group.items()))
+    repeated = np.flatnonzero(often[which.reshape(-1)] > 1)[:_REPEATED]
+    if count < 3:
+        return repeated.tolist()
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    ends = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
+    detour = (steps[:-1] + steps[1:]) / np.maximum(ends, max(np.median(steps), 1e-30))
+    astray = 1 + np.argsort(-detour, kind="stable")[:_ASTRAY]
+    return [*repeated.tolist(), *(int(i) for i in astray if detour[i - 1] > _DETOUR)]
 
 
 def _photo(view: View) -> np.ndarray | None:

@@ -152,10 +152,17 @@ def _poses(views: list[View], rig: Rig, points: Points | None, *, far: bool) -> 
     if fit is not None and (fit.shares < _MATCHES_CONTRADICT).any() and not matches.widened:
         matches.widen()
         fit = matches.fit(rig)
-    if fit is not None and not far and (lost := _lost(rig, matches, fit)):
-        names = first_names([views[sample.views[i]].name for i in lost], 5)
-        text = f"the poses of {names} contradict their matches with all other photos"
-        return [*found, Finding("poses", f"{text}; remove these photos, or correct their poses")]
+    if fit is not None and not far:
+        for wrong, text in (
+            (_lost(rig, matches, fit), "contradict their matches with all other photos"),
+            (_frozen(rig, matches, fit), "are those of other photos, which show other places"),
+        ):
+            if wrong:
+                photos = tuple(views[sample.views[i]].name for i in wrong)
+                text = f"the poses of {first_names(photos, 5)} {text}; a training leaves them out"
+                found = [*found, Finding("poses", text, photos=photos)]
+        if any(finding.photos for finding in found):
+            return found
     return _inexact(fit, tracks, far=far)
 
 
@@ -184,7 +191,33 @@ def _lost(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[int]:
         lost.add(min(contradicted, key=contradicted.__getitem__))
     rest = [share for _, share in pairs]
     proven = len(rest) >= _PAIRS_FOR_PROOF and np.median(rest) >= _MATCHES_PROVE
-    return sorted(lost) if proven else []
+    return sorted(lost) if proven and 2 * len(lost) < len(rig) else []
+
+
+def _frozen(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[int]:
+    """The views of the sample with the pose of another one that shows another place, and fits this
+    pose better. Trackers that were lost repeat a pose."""
+    same = [
+        np.array_equal(rig.translation[pair.a], rig.translation[pair.b])
+        and np.array_equal(rig.rotation[pair.a], rig.rotation[pair.b])
+        for pair in matches.pairs
+    ]
+    distances: dict[int, list[float]] = {}
+    for pair, equal, median in zip(matches.pairs, same, fit.medians, strict=True):
+        for view in () if equal else (pair.a, pair.b):
+            distances.setdefault(view, []).append(median)
+    typical = {
+        view: float(np.median(each))
+        for view, each in distances.items()
+        if len(each) >= _FEWEST_PAIRS
+    }
+    frozen = set()
+    for pair, equal in zip(matches.pairs, same, strict=True):
+        if equal and pair.moved >= _MATCHES_PROVE and {pair.a, pair.b} <= typical.keys():
+            right, wrong = sorted((pair.a, pair.b), key=typical.__getitem__)
+            if typical[wrong] >= _SHARPER * typical[right]:
+                frozen.add(wrong)
+    return sorted(frozen)
 
 
 def _inexact(fit: Fit | None, tracks: TrackFit | None, *, far: bool) -> list[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -45,6 +46,8 @@ _LONGEST_HEADER = 8 << 20
 _MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")
 _SCAN = b"\xff\xda"  # start of a scan
 _END = b"\xff\xd9"  # end of the image
+# The bytes at the end of a JPEG among which its end is searched: some programs add a few.
+_TAIL = 1 << 12
 _JPEG = b"\xff\xd8"  # the first bytes of a JPEG
 _PNG = b"\x89PNG\r\n\x1a\n"  # the first bytes of a PNG
 
@@ -58,6 +61,7 @@ def open_image(
         path: the file.
         formats: the formats to accept, by Pillow's names.
         header_only: the caller does not decode the pixels, so the scans of a JPEG are not checked.
+            If the file does not end as it should, it is decoded here.
         page: which page of a file with several, from 0.
 
     Raises:
@@ -65,14 +69,18 @@ def open_image(
         Exception: anything that Pillow raises for a damaged file.
     """
     with open(path, "rb") as file:
-        _check_header(file)
+        complete = _check_header(file)
     image = Image.open(path, formats=list(formats))
     try:
         if page:
             image.seek(page)
-        _check_size(image)
-        if not header_only and image.format in ("JPEG", "MPO"):
+        _check_size(image, os.path.getsize(path))
+        if image.format in ("JPEG", "MPO") and not (header_only and complete):
             _check_scans(image, path)
+        if header_only and not complete:  # a copy that was interrupted, or bytes after the image
+            with Image.open(path, formats=list(formats)) as whole:
+                whole.draft(None, (1, 1))
+                whole.load()
         if image.width * image.height > MOST_PIXELS:
             image.draft(None, (image.width // 2, image.height // 2))
     except BaseException:
@@ -100,25 +108,31 @@ def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _check_header(file: BinaryIO) -> None:
+def _check_header(file: BinaryIO) -> bool:
+    """Whether the file ends as its format requires; True if that is not known."""
     if file.read(len(GIT_LFS)) == GIT_LFS:
         raise Problem("is a pointer of Git LFS; run git lfs pull")
+    size = os.fstat(file.fileno()).st_size
     file.seek(0)
     start = file.read(len(_PNG))
     if start == _PNG:
         for _ in range(_MOST_SEGMENTS):
             head = file.read(8)  # length and name of a chunk; 4 bytes of checksum follow its data
             if len(head) < 8 or head[4:] == b"IEND":
-                return
+                return len(head) == 8
             file.seek(int.from_bytes(head[:4], "big") + 4, 1)
         raise Problem("too many chunks")
     if start.startswith(_JPEG):
         header = start + file.read(_LONGEST_HEADER)
         if len(header) > _LONGEST_HEADER and _SCAN not in _segments(header):
             raise Problem("too many bytes before its pixels")
+        file.seek(max(0, size - _TAIL))
+        return _END in file.read(_TAIL)
+    return not start.startswith(b"RIFF") or int.from_bytes(start[4:], "little") + 8 <= size
 
 
-def _check_size(image: Image.Image) -> None:
+def _check_size(image: Image.Image, size: int) -> None:
+    """``size``: of the file in bytes."""
     width, height = image.size
     most = _MOST_JPEG_PIXELS if image.format in ("JPEG", "MPO") else MOST_PIXELS
     if width * height > most or max(width, height) > LONGEST_SIDE:
@@ -137,6 +151,9 @@ def _check_size(image: Image.Image) -> None:
             sides[0] * sides[1] > max(_MOST_TILE_PIXELS, width * height)
         ):
             raise Problem("has tiles larger than the image")
+        places, lengths = (tags.get(a) or tags.get(b) or () for a, b in ((273, 324), (279, 325)))
+        if any(a + b > size for a, b in zip(places, lengths, strict=False)):
+            raise Problem("its data ends early")
 
 
 def _check_scans(image: Image.Image, path: Path) -> None:

@@ -17,14 +17,17 @@ logger = logging.getLogger(__name__)
 _SIDE = 64  # pixels of the copies of photos, which are not used
 
 
-def check_cameras(dataset: Dataset, path: str, *, trusted: bool = False) -> tuple[str, ...]:
+def check_cameras(
+    dataset: Dataset, path: str, *, trusted: bool = False
+) -> tuple[tuple[str, ...], list[str]]:
     """Judge the cameras of a dataset; see `snowsplat.data.judge.verdict.judge`.
 
     Args:
         path: of the dataset, for messages.
         trusted: the user is sure of the cameras: what is impossible is a doubt too.
 
-    Returns one sentence for each doubt, for the report. Each is also logged as a warning.
+    Returns one sentence for each doubt, for the report, each of which is also logged as a warning;
+    and the photos to leave out, because the matches contradict their poses.
 
     Raises: UserError: the cameras are impossible. The message says why, and what to do.
     """
@@ -38,7 +41,9 @@ def check_cameras(dataset: Dataset, path: str, *, trusted: bool = False) -> tupl
             )
     for finding in findings:
         logger.warning("warning: %s: %s", path, finding.text)
-    return tuple(finding.text for finding in findings)
+    wrong = {name for finding in findings if not trusted for name in finding.photos}
+    views = [view for view in [*dataset.train, *dataset.test] if view.name in wrong]
+    return tuple(finding.text for finding in findings), sorted({view.photo for view in views})
 
 
 def check_test_photos(views: Sequence[View]) -> None:

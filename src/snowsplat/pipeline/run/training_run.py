@@ -24,7 +24,12 @@ from snowsplat.pipeline.run.training_files import write_beginning, write_cameras
 from snowsplat.pipeline.run.watchers import Watchers
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import Project
-from snowsplat.project.training_folder import UNEXPLAINED, DatasetSettings, TrainingFolder
+from snowsplat.project.training_folder import (
+    CONTRADICTED,
+    UNEXPLAINED,
+    DatasetSettings,
+    TrainingFolder,
+)
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.sfm.report.capture_verdict import recorded_verdict
 from snowsplat.training.budgets.memory_budget import MemoryPlan
@@ -164,7 +169,10 @@ class TrainingRun:
 
     def _left_out(self) -> tuple[LeftOut, ...]:
         views = self.trainer.dataset.train
-        return tuple(LeftOut(views[i].name, "training", UNEXPLAINED) for i in self.trainer.excluded)
+        return (
+            *(LeftOut(name, "poses", CONTRADICTED) for name in self.settings.left_out or []),
+            *(LeftOut(views[i].name, "training", UNEXPLAINED) for i in self.trainer.excluded),
+        )
 
     def _checkpoint_is_due(self, step: int) -> bool:
         every, seconds = self.config.checkpoint_every, self.request.options.checkpoint_seconds
