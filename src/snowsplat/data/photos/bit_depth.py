@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from snowsplat.data.photos.image_file import open_image
+from snowsplat.data.photos.tone_mapping import standard_range
 from snowsplat.util.errors import Problem
 
 logger = logging.getLogger(__name__)
@@ -40,7 +41,7 @@ _lock = threading.Lock()
 
 
 def eight_bits(image: Image.Image, path: Path) -> Image.Image:
-    """The image with 8 bits per channel; the same object if it has no more.
+    """The image with 8 bits per channel in standard range; the same object if it has no more.
 
     Args:
         image: opened, not decoded.
@@ -53,7 +54,7 @@ def eight_bits(image: Image.Image, path: Path) -> Image.Image:
     if image.mode == "F":
         raise Problem("floating-point pixels are not supported")
     if not _is_deep(image):
-        return image
+        return standard_range(image, path)
     scale = _scale_of(path)
     if not image.mode.startswith("I") and scale is None:
         return image  # Pillow reads the upper byte
