@@ -14,14 +14,9 @@ from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
 
 
-def attempt(registered, agreement=0.99, error=1.0, misfit=1.0, lens=None, doubts=()):
+def attempt(registered, agreement=0.99, misfit=1.0, doubts=()):
     return SimpleNamespace(
-        registered=registered,
-        agreement=agreement,
-        error=error,
-        misfit=misfit,
-        lens=lens or Lens(),
-        doubts=doubts,
+        registered=registered, agreement=agreement, misfit=misfit, doubts=doubts, models=[]
     )
 
 
@@ -51,35 +46,27 @@ def test_attempts_end_early_if_time_is_short(job, seconds, elapsed, registered, 
 
 
 @pytest.mark.parametrize(
-    ("attempts", "good", "best"),
-    [
-        ([(9, 0.99)], True, 0),
-        ([(9, 0.8)], False, 0),  # enough photos, but the model is bent
-        ([(10, 0.8), (10, 0.99)], True, 1),
-        ([(10, 0.8), (4, 0.99)], False, 0),
-    ],
+    ("agreement", "good"),
+    [(0.99, True), (0.8, False)],  # the latter: enough photos, but the model is bent
 )
-def test_a_bent_model_is_not_good(job, attempts, good, best):
-    job.attempts = [attempt(*each) for each in attempts]
+def test_a_bent_model_is_not_good(job, agreement, good):
+    job.attempts = [attempt(9, agreement)]
     assert job._good == good
-    assert best_attempt(job.attempts) is job.attempts[best]
 
 
-def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors():
-    fisheye = attempt(9, 0.95, 0.24, 0.24, Lens(fisheyes=frozenset([1])))
-    ordinary = attempt(10, 0.99, 0.62, 0.62)
-    assert best_attempt([fisheye, ordinary]) is fisheye
-    ordinary.error = 0.25
-    assert best_attempt([fisheye, ordinary]) is ordinary
+def test_the_attempt_with_the_highest_score_is_used():
+    few, many = attempt(9), attempt(10)
+    assert best_attempt([few, many], [5000.0, 4000.0]) is few
+    assert best_attempt([few, many], [-5.0, -4.0]) is many
 
 
 def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches():
     """A few photos of a flat field: with a wrong focal length, the poses are bent."""
-    bent = attempt(5, 0.79, 0.69, 1.10e-3, doubts=["the focal length in EXIF does not agree"])
-    other = attempt(5, 0.75, 0.61, 1.00e-3)
-    assert best_attempt([bent, other]) is other
+    bent = attempt(5, misfit=1.10e-3, doubts=["the focal length in EXIF does not agree"])
+    other = attempt(5, misfit=1.00e-3)
+    assert best_attempt([bent, other], [1010.0, 1000.0]) is other
     other.misfit = 1.2e-3  # the photos contradict the focal length in EXIF
-    assert best_attempt([bent, other]) is bent
+    assert best_attempt([bent, other], [1010.0, 1000.0]) is bent
 
 
 @pytest.mark.parametrize(

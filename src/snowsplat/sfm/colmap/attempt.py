@@ -79,11 +79,6 @@ class Attempt:
         return self.models[0].num_reg_images() if self.models else 0
 
     @property
-    def error(self) -> float:
-        """The mean reprojection error of the first model, in pixels of the photos."""
-        return self.models[0].compute_mean_reprojection_error() if self.models else float("inf")
-
-    @property
     def misfit(self) -> float:
         """`lens.misfit` of the first model."""
         return misfit(self.models[0]) if self.models else float("inf")

@@ -11,8 +11,8 @@ others (`camera_groups`).
 
 The attempts end when one of them finds poses for 90% of the usable photos (`Evidence.usable`), or
 when the matches show that no further attempt can succeed. If these poses do not agree with the
-matches, some further attempts are made, too. The result is the possible model (see `lens`) with the
-most registered photos, weighted by its agreement with the matches.
+matches, some further attempts are made, too. The result is the model with the highest `score`: that
+which makes the verified matches of all photos, and its lenses, most probable.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.attempt import AnyMapper, Attempt, AttemptRunner, Matched
 from snowsplat.sfm.colmap.checks.consistency import CONSISTENT
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
+from snowsplat.sfm.colmap.checks.score import PairMatches, Score, read_matches, score_of
 from snowsplat.sfm.colmap.database import (
     forget_verification,
     remove_database,
@@ -56,11 +57,8 @@ _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
 # The expected time from the start of the job to the end of the next attempt, divided by the time
 # from the start of the job until now.
 _NEXT_ATTEMPT = 3.0
-# A model of the wrong kind of lens has larger errors than one of the right kind, by this factor.
-_OTHER_LENS = 1.25
-# The photos of a model that is in doubt count as this share of their number: it is chosen only if
-# it has twice as many photos as one without doubts.
-_IN_DOUBT = 0.5
+# A model with a lens in doubt is chosen only if its score is this many times that of one without.
+_IN_DOUBT = 2.0
 # Each attempt with several focal lengths has better estimates of them than the one before.
 _ZOOM_ATTEMPTS = 3
 
@@ -88,6 +86,9 @@ class PoseEstimation:
         self.lens_evidence: dict[int, LensEvidence] = {}  # by camera id
         self.started = time.monotonic()
         self.attempts: list[Attempt] = []
+        # The matches of all photos, and the scores of attempts with these; None: they have changed.
+        self.pairs: list[PairMatches] | None = None
+        self.scores: dict[int, Score] = {}  # by the identity of the attempt
         self.log: list[str] = []  # a description of each attempt, as text for users
 
     @property
@@ -102,14 +103,14 @@ class PoseEstimation:
         shutil.rmtree(self.dataset.distorted_models, ignore_errors=True)
         given = self.photos
         self._make_attempts(effort)
-        best = best_attempt(self.attempts)
+        best = self._best()
         if not best.models:
             doubts = next((a.doubts for a in self.attempts if a.doubts), [])
             error = failure(self.runner.evidence(self.matched), doubts)
             remove_database(self.strong_database)
             raise error
         self.runner.progress.show_poses(best.models[0], True)
-        image_size = best.matched.effort.image_size
+        choice, image_size = self._describe_choice(best), best.matched.effort.image_size
         models = [best.mapping.complete(model, image_size) for model in best.models]
         for model in models:
             model.extract_colors_for_all_images(self.dataset.photos, self.runner.threads)
@@ -133,7 +134,7 @@ class PoseEstimation:
             held=best.mapping.held,
             unregistered=unregistered,
             pairs=best.matched.choice.description,
-            attempts=self.log,
+            attempts=self.log + choice,
             doubts=doubts + self._doubt_about_fisheye(best),
             zooms="" if self.photos is given else camera_groups.describe(models[0]),
             agreement=best.agreement,
@@ -158,7 +159,7 @@ class PoseEstimation:
         if self.lens.fisheyes and not self._good:
             # The matches, or a disc, may suggest a fisheye lens where there is none.
             self._try("as configured", lens=replace(self.lens, fisheyes=frozenset(), focals={}))
-            self.lens = best_attempt(self.attempts).lens
+            self.lens = self._best().lens
         if not self._found and self.evidence.more_effort_is_useless:
             return
         other: Mapper = "incremental" if self.mapper == "global" else "global"
@@ -211,18 +212,20 @@ class PoseEstimation:
         """Match and verify those of these pairs that are not verified yet."""
         self.matched = replace(self.matched, choice=choice)
         self.runner.verify(self.matched, self.lens)
+        self.pairs = None
         self.evidence = self.runner.evidence(self.matched)
 
     def _match_again(self, database: Path, effort: Effort, pairing: Effort) -> None:
         self.matched = self.runner.match(database, effort, pairing)
         self.runner.verify(self.matched, self.lens)
+        self.pairs = None
 
     def _try_zooms(self) -> None:
         """The photos of a camera may have several focal lengths, which remain for the others.
 
         Fisheye lenses with a zoom are rare, so they are not tried."""
         lens = self.lens
-        one, best = self.photos, best_attempt(self.attempts)
+        one, best = self.photos, self._best()
         if lens.any_fisheye or not camera_groups.may_differ(one):
             return
         if not self._enough:
@@ -239,7 +242,7 @@ class PoseEstimation:
             self.runner.photos = several
             begin = replace(lens, focals=focals_by_camera(several, focals))
             self._try("with several focal lengths", lens=begin)
-            made, best = self.attempts.pop(), best_attempt(self.attempts)
+            made, best = self.attempts.pop(), self._best()
             made_better = bool(made.models) and camera_groups.better(
                 made.models[0], best.models, several=before is not one
             )
@@ -297,6 +300,35 @@ class PoseEstimation:
             "ordinary one; state the camera model OPENCV_FISHEYE"
         ]
 
+    def _best(self) -> Attempt:
+        """The attempt whose model is most probable; without a model, the first one."""
+        made = [attempt for attempt in self.attempts if attempt.models]
+        if len(made) < 2:
+            return (made or self.attempts)[0]
+        return best_attempt(made, [self._score(attempt).total for attempt in made])
+
+    def _score(self, attempt: Attempt) -> Score:
+        if self.pairs is None:
+            self.pairs, self.scores = read_matches(self.matched.database), {}
+        if id(attempt) not in self.scores:
+            exif = {i: photo.focal for i, photo in enumerate(self.photos, 1) if photo.focal}
+            self.scores[id(attempt)] = score_of(attempt.models[0], self.pairs, exif)
+        return self.scores[id(attempt)]
+
+    def _describe_choice(self, best: Attempt) -> list[str]:
+        """Which attempt was chosen, and how certain this is; empty if there was no choice."""
+        others = [a for a in self.attempts if a.models and a is not best]
+        if not others:
+            return []
+        score = self._score(best)
+        second = max((self._score(attempt) for attempt in others), key=lambda s: s.total)
+        number = self.log.index(best.description) + 1
+        return [
+            f"attempt {number} is used: its poses explain {score.explained:.0%} of the matches of "
+            f"all photos, those of the next best one {second.explained:.0%} (logarithm of the "
+            f"odds: {score.total - second.total:.0f})"
+        ]
+
     @property
     def _found(self) -> bool:
         """Whether an attempt has found poses."""
@@ -305,7 +337,7 @@ class PoseEstimation:
     @property
     def _good(self) -> bool:
         """Whether enough photos are registered, in a model that agrees with its matches."""
-        consistent = best_attempt(self.attempts).agreement >= CONSISTENT
+        consistent = self._best().agreement >= CONSISTENT
         return self._enough and (consistent or self._late)
 
     @property
@@ -327,25 +359,21 @@ class PoseEstimation:
         If the photos do not determine the focal length, the model that was made with a wrong one is
         bent, so `settled`, which starts from this model, may not find that EXIF is right.
         """
-        doubtful = self.lens.exif and bool(best_attempt(self.attempts).doubts) and not self._late
+        doubtful = self.lens.exif and bool(self._best().doubts) and not self._late
         return doubtful and bool(exif_focals(self.photos))
 
 
-def best_attempt(attempts: Sequence[Attempt]) -> Attempt:
-    """The attempt with the most registered photos, weighted by the share of correct matches.
+def best_attempt(attempts: Sequence[Attempt], scores: Sequence[float]) -> Attempt:
+    """The attempt with the highest score in nats; one whose lens is in doubt, for example because
+    of EXIF, only if no other lens agrees equally well with the matches.
 
-    A model that is bent, because photos were registered with too few points, may have all photos.
-    So may a model of the wrong kind of lens, but it has larger errors. A lens in doubt, for example
-    because of EXIF, is right only if no other lens agrees equally well with the matches.
+    Errors of the calibration that all photos have in common are no evidence against EXIF.
     """
-    least = min(attempt.error for attempt in attempts)
-    lenses = {attempt.lens.any_fisheye for attempt in attempts}
     undoubted = min((a.misfit for a in attempts if not a.doubts), default=float("inf"))
 
-    def score(attempt: Attempt) -> float:
-        wrong_kind = len(lenses) > 1 and attempt.error > _OTHER_LENS * least
+    def value(entry: tuple[Attempt, float]) -> float:
+        attempt, score = entry
         doubtful = attempt.doubts and undoubted <= (1 + EQUAL_ERROR) * attempt.misfit
-        weight = _IN_DOUBT if wrong_kind or doubtful else 1.0
-        return attempt.registered * attempt.agreement * weight
+        return score / _IN_DOUBT if doubtful and score > 0 else score
 
-    return max(attempts, key=score)
+    return max(zip(attempts, scores, strict=True), key=value)[0]

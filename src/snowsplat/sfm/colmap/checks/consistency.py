@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from snowsplat.data.lens.models import lens_of
 from snowsplat.sfm.colmap.database import VerifiedPair, closing_database, verified_pairs
-from snowsplat.sfm.colmap.epipolar import Floats, homogeneous, sampson_distances
+from snowsplat.sfm.colmap.epipolar import Floats, distances_of_matches
 from snowsplat.sfm.colmap.features.extraction import SEED
 from snowsplat.sfm.colmap.lenses.lens import is_fisheye, pixels_per_radian
 from snowsplat.sfm.colmap.mapping.view_graph import database_names, following_pairs
@@ -55,7 +55,6 @@ _MIN_AGREEING = 0.5
 _CONFIRMED = 0.8
 _TORN = 0.3
 _MIN_MISS_DISTANCE = 4.0  # of a miss, in units of the ``max_error`` of `check_pairs`
-_MIN_ANGLE = 2.0  # degrees: two rays with a smaller angle between them count as parallel
 #: A model is bent if its agreement is less than this (`agreement_of`). That of right models is 0.99
 #: or more, and 0.94 in a room whose carpet repeats; of three bent ones, it is 0.61 to 0.79.
 CONSISTENT = 0.93
@@ -161,7 +160,7 @@ def agreement_of_model(
             if found is None:
                 return 1.0
             error = max_error / float(np.mean([pixels_per_radian(c) for c in (one, two)]))
-            rays = _rays(one, first), _rays(two, second)
+            rays = rays_of(one, first), rays_of(two, second)
             return agreement(found["cam2_from_cam1"], *rays, error)
 
         checked = check_pairs(model, database, max_error) if pairs is None else pairs
@@ -187,11 +186,11 @@ def check_pairs(
         names = database_names(source)
         follow = following_pairs(names)
 
-        def rays_of(image_id: int, features: Ints) -> Floats:
+        def matched_rays(image_id: int, features: Ints) -> Floats:
             if image_id not in rays:
                 camera = model.camera(model.image(image_id).camera_id)
                 pixels = source.read_keypoints(image_id)[:, :2].astype(np.float64)
-                rays[image_id] = _rays(camera, pixels)
+                rays[image_id] = rays_of(camera, pixels)
             return rays[image_id][features]
 
         for found in sorted(verified_pairs(database), key=lambda p: (p.first, p.second)):
@@ -204,7 +203,7 @@ def check_pairs(
             images = model.image(first), model.image(second)
             focal = np.mean([pixels_per_radian(model.camera(i.camera_id)) for i in images])
             pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
-            both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
+            both = matched_rays(first, rows[:, 0]), matched_rays(second, rows[:, 1])
             error = max_error / float(focal)
             sides = (images[0], of_first, both[0]), (images[1], of_second, both[1])
             missed = _misses((ids, xyz), sides[0], sides[1], _MIN_MISS_DISTANCE * error)
@@ -248,7 +247,7 @@ def _without_bridged_tears(
     return [replace(p, follows=False) if p.follows and is_bridged(p) else p for p in pairs]
 
 
-def _rays(camera: pycolmap.Camera, pixels: Floats) -> Floats:
+def rays_of(camera: pycolmap.Camera, pixels: Floats) -> Floats:
     """The positions (N, 2) of ``pixels`` (N, 2) in the normalised image plane of a camera.
 
     For a fisheye lens or a panorama, unit vectors (N, 3): its pixels are angles, up to 90° or more
@@ -308,16 +307,4 @@ def agreement(
         max_error: in the unit of the normalised image plane or of the unit sphere.
     """
     rotation, translation = cam2_from_cam1.rotation.matrix(), cam2_from_cam1.translation
-    x, y, z = translation
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    distance = sampson_distances(essential, rays1, rays2)
-    one, two = homogeneous(rays1), homogeneous(rays2)
-    # depth1 · one + translation ≈ depth2 · two, with both rays in the frame of the second camera.
-    one = one @ rotation.T
-    one /= np.linalg.norm(one, axis=1, keepdims=True)
-    two /= np.linalg.norm(two, axis=1, keepdims=True)
-    cosine = (one * two).sum(1)
-    along1, along2 = one @ translation, two @ translation
-    is_in_front = (cosine * along2 > along1) & (along2 > cosine * along1)
-    is_parallel = cosine > np.cos(np.radians(_MIN_ANGLE))
-    return float(np.mean((distance <= max_error) & (is_in_front | is_parallel)))
+    return float(np.mean(distances_of_matches(rotation, translation, rays1, rays2) <= max_error))

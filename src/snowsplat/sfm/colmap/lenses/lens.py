@@ -31,8 +31,8 @@ _MIN_PHOTOS_FOR_OPENCV = 8
 #: Focal length of photos without EXIF, divided by the longest side: that of a 29 mm lens on 35 mm
 #: film. It is between the values for the photos of a phone and for its videos, which are cropped.
 GUESSED_FOCAL = 0.8
-# The same for a fisheye lens: its longest side spans 115°.
-_GUESSED_FISHEYE = 0.5
+#: The same for a fisheye lens: its longest side spans 115°.
+GUESSED_FISHEYE = 0.5
 # A lens whose picture is a disc spans about this angle: 180° to 220°.
 _CIRCLE = 190.0
 # Models without coefficients; a fisheye lens then begins without one, too.
@@ -134,7 +134,7 @@ def cameras_of(photos: Sequence[Photo], lens: Lens) -> list[pycolmap.Camera]:
         model, guess = lens.model, GUESSED_FOCAL
         if number in lens.fisheyes or is_fisheye(model):
             model = "SIMPLE_FISHEYE" if model in _EQUIDISTANT else "SIMPLE_RADIAL_FISHEYE"
-            guess = _GUESSED_FISHEYE
+            guess = GUESSED_FISHEYE
         elif model == "auto":
             enough = ids.count(number) >= _MIN_PHOTOS_FOR_OPENCV and not lens.held
             model = "OPENCV" if enough else "SIMPLE_RADIAL"
@@ -225,12 +225,12 @@ def findings_of(camera: pycolmap.Camera) -> list[Finding]:
         reason = _implausible_distortion(camera)
     if reason:
         return [*found, Finding("distortion", reason, True)]
-    barrel = _barrel(camera)
-    if barrel < -_MAX_BARREL:
+    moved = barrel(camera)
+    if moved < -_MAX_BARREL:
         found.append(
             Finding(
                 "distortion",
-                f"the lens distortion moves pixels at the border by {barrel:.0%}, as a fisheye "
+                f"the lens distortion moves pixels at the border by {moved:.0%}, as a fisheye "
                 "lens does; if it is one, state the camera model OPENCV_FISHEYE",
             )
         )
@@ -258,7 +258,7 @@ def _implausible_fisheye(camera: pycolmap.Camera) -> str:
     return ""
 
 
-def _barrel(camera: pycolmap.Camera) -> float:
+def barrel(camera: pycolmap.Camera) -> float:
     """The share by which a polynomial distortion moves pixels at the border; negative: inwards."""
     if camera.model_name not in _POLYNOMIAL:
         return 0.0
