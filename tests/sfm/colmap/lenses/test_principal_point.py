@@ -4,6 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from snowsplat.sfm.colmap.lenses import principal_point
 from snowsplat.sfm.colmap.lenses.principal_point import (
     SIGMA,
     combine_with_prior,
@@ -118,3 +119,11 @@ def test_a_certain_estimate_and_none_at_all():
     assert np.allclose(combine_with_prior(estimate, 1e-12 * np.eye(2), centre, 1.0), estimate)
     far = combine_with_prior(estimate, 1e12 * np.eye(2), centre, 1.0)
     assert np.allclose(far, centre, atol=1e-9)
+    nothing = np.full((2, 2), np.inf)
+    assert (combine_with_prior(estimate, nothing, centre, 1.0) == centre).all()
+
+
+def test_of_many_photos_some_tell_the_covariance(monkeypatch):
+    monkeypatch.setattr(principal_point, "_MOST_PHOTOS", 6)
+    found = refine_principal_points(photographed(list(round_walk()), box_of_points()), 1)
+    assert np.abs(point_of(found) - TRUE).max() < 0.5

@@ -31,6 +31,9 @@ from snowsplat.sfm.colmap.lenses.lens import robust_adjustment, used_cameras
 #: Standard deviation of a principal point from the centre of the photo, in each direction, divided
 #: by the longer side. The lens on a sensor is off by about this.
 SIGMA = 0.01
+# The covariance is that of at most this number of photos, because its time grows with their cube:
+# 1 s. More photos determine more, so it is too large rather than too small.
+_MOST_PHOTOS = 200
 _TOLERANCE = 1e-4  # of bundle adjustment, as in `robust_adjustment`
 Floats = NDArray[np.float64]
 
@@ -48,7 +51,12 @@ def refine_principal_points(
         return model
     made = copy.deepcopy(model)
     scale = model.compute_mean_reprojection_error()
-    adjuster, summary = _adjust(made, scale, threads, free=True)
+    images = sorted(model.reg_image_ids())
+    adjuster = _adjuster(made, images, scale, threads, free=True)
+    summary = adjuster.solve()
+    if len(images) > _MOST_PHOTOS:
+        some = np.linspace(0, len(images) - 1, _MOST_PHOTOS).round().astype(int)
+        adjuster = _adjuster(made, [images[i] for i in some], scale, threads, free=True)
     covariances = _covariances(made, numbers, adjuster, summary)
     if covariances is None:
         return model
@@ -60,7 +68,7 @@ def refine_principal_points(
         sigma = SIGMA * max(camera.width, camera.height)
         params[rows] = combine_with_prior(params[rows], covariance, centre, sigma)
         camera.params = params
-    _adjust(made, scale, threads, free=False)
+    _adjuster(made, images, scale, threads, free=False).solve()
     made.update_point_3d_errors()
     return made
 
@@ -71,26 +79,28 @@ def combine_with_prior(
     """(2,) the maximum of the product of two Gaussians, in pixels.
 
     Args:
-        estimate, covariance: (2,) and (2, 2), of the observations.
+        estimate, covariance: (2,) and (2, 2), of the observations; infinite: they say nothing.
         centre, sigma: (2,) and the standard deviation in each direction, of the prior.
     """
     # Λ (Λ + Π)⁻¹ = Π⁻¹ (Λ⁻¹ + Π⁻¹)⁻¹: the gain of a Kalman filter, which has no inverse of C.
+    if not np.isfinite(covariance).all():
+        return centre
     gain = sigma**2 * np.linalg.inv(covariance + sigma**2 * np.eye(2))
     return centre + gain @ (estimate - centre)
 
 
-def _adjust(
-    model: pycolmap.Reconstruction, scale: float, threads: int, free: bool
-) -> tuple[pycolmap.CeresBundleAdjuster, pycolmap.CeresBundleAdjustmentSummary]:
-    """Run bundle adjustment; ``free``: with principal points. ``scale`` of the loss in pixels."""
+def _adjuster(
+    model: pycolmap.Reconstruction, images: Sequence[int], scale: float, threads: int, free: bool
+) -> pycolmap.CeresBundleAdjuster:
+    """Bundle adjustment of ``images``; ``free``: with principal points; ``scale`` of the loss in
+    pixels."""
     config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
+    for image_id in images:
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = robust_adjustment(threads, _TOLERANCE, scale)
     options.refine_principal_point = free
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    return adjuster, adjuster.solve()
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
 
 
 def _covariances(
@@ -114,7 +124,10 @@ def _covariances(
     for number in numbers:
         camera = model.cameras[number]
         whole = found.get_other_params_cov(camera.params)
-        if whole is None or len(whole) != len(camera.params) or not np.isfinite(whole).all():
+        if whole is None:  # none of the chosen photos has this camera
+            covariances.append(np.full((2, 2), np.inf))
+            continue
+        if len(whole) != len(camera.params) or not np.isfinite(whole).all():
             return None
         rows = list(camera.principal_point_idxs())
         covariances.append(variance * whole[np.ix_(rows, rows)])
