@@ -51,8 +51,8 @@ def variants(*among: Variant) -> list:
     """Parameters of a fixture, with the marks of their engines.
 
     Only the CPU's kernels depend on the instruction set, so only they are marked `isa`. The
-    reference and the kernels of a GPU would only repeat the same check. Without a GPU, its 1,800
-    tests are left out: to collect and skip them takes seconds in each process.
+    reference and the kernels of a GPU would only repeat the same check. Tests that need a GPU exist
+    only where there is one.
     """
     marks = {"native": pytest.mark.isa, "cuda": pytest.mark.gpu, "emulated": pytest.mark.emulated}
     return [

@@ -6,6 +6,7 @@ The search by hypothesis takes seconds here; tests/nightly/fuzz_ops.py runs it f
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -15,12 +16,25 @@ from torch import Tensor
 
 from snowsplat.ops import AdamRates, Splats2D
 
-from .extremes import CHECKS, LONG, check_photometric
+from .extremes import (
+    CHECKS,
+    COLORS,
+    FOCALS,
+    LONG,
+    OPACITIES,
+    PLACES,
+    QUATS,
+    SCALES,
+    SIZES,
+    Extreme,
+    check_harm,
+    check_photometric,
+    check_project,
+    check_rasterize,
+)
 from .scenes import (
     PARAMETERS,
-    Scene,
     Variant,
-    as_float32,
     assert_close,
     generator,
     leaf_splats,
@@ -28,92 +42,7 @@ from .scenes import (
     random_scene,
     random_splats,
     take_step,
-    uniform,
 )
-
-COUNT = 64
-
-
-def wild(seed: int) -> dict[str, Tensor]:
-    """Extreme values for each parameter of `random_scene`; the tests choose among them."""
-    g = generator(seed)
-    scene = random_scene(seed, COUNT)
-    means, pose = scene.params["means"], scene.cam_from_world
-    position = -pose[:, :3].T @ pose[:, 3]
-    forward = pose[2, :3]
-    on_axis = position + uniform(g, -3, 3, COUNT, 1) * forward
-    at_near = position + 0.2 * forward + 1e-4 * normal(g, COUNT, 3)
-    zero_quats = scene.params["quats"].clone()
-    zero_quats[::2] = 0
-    return {
-        "huge_scales": torch.full((COUNT, 3), 27.0),
-        "tiny_scales": torch.full((COUNT, 3), -27.0),
-        "mixed_scales": uniform(g, -27, 27, COUNT, 3),
-        "needles": torch.tensor([-27.0, 3.0, -27.0]).expand(COUNT, 3),
-        "discs": torch.tensor([3.0, -27.0, 3.0]).expand(COUNT, 3),
-        "long_discs": torch.tensor([12.0, -27.0, 3.0]).expand(COUNT, 3),
-        "behind": means - 20 * forward,
-        "at_camera": position.expand(COUNT, 3),
-        "around_camera": position + 0.3 * normal(g, COUNT, 3),
-        "on_axis": on_axis,
-        "at_near": at_near,
-        "far": position + 1e6 * (means - position),
-        "sideways": means + 1e5 * pose[0, :3],
-        "everywhere": 10 ** uniform(g, -6, 12, COUNT, 1) * normal(g, COUNT, 3),
-        "zero_quats": zero_quats,
-        "tiny_quats": scene.params["quats"] * 1e-30,
-        "huge_quats": scene.params["quats"] * 1e15,
-        "opaque": torch.full((COUNT,), 100.0),
-        "transparent": torch.full((COUNT,), -100.0),
-        "huge_colors": scene.params["sh_rest"] * 1e6,
-        "negative_colors": torch.full((COUNT, 1, 3), -100.0),
-    }
-
-
-NAMES = {
-    "means": "behind at_camera around_camera on_axis at_near far sideways everywhere",
-    "log_scales": "huge_scales tiny_scales mixed_scales needles discs long_discs",
-    "quats": "zero_quats tiny_quats huge_quats",
-    "opacity_logits": "opaque transparent",
-    "sh_rest": "huge_colors",
-    "sh_dc": "negative_colors",
-}
-SINGLE = [(name, case) for name, cases in NAMES.items() for case in cases.split()]
-
-
-def check(variant: Variant, scene: Scene) -> None:
-    """Projects, rasterizes with depth, and takes a step; all intermediate numbers are checked."""
-    leaf = scene.to(variant.dtype)
-    splats = leaf.project(variant.ops)
-    splats.packed.retain_grad()
-    width, height = leaf.size
-    background = torch.ones(3, dtype=variant.dtype)
-    outputs = variant.ops.rasterize(splats, width, height, background, with_depth=True)
-    found = {"packed": splats.packed, "image": outputs[0], "alpha": outputs[1]}
-    target = torch.rand(height, width, 3, generator=generator(0)).to(variant.dtype)
-    loss = variant.ops.photometric_loss(outputs[0], target) + outputs[1].mean()
-    loss.backward()
-    assert splats.packed.grad is not None
-    found.update({"depth": outputs[2], "loss": loss, "packed gradient": splats.packed.grad})
-    found.update({f"gradient of {n}": t.grad for n, t in leaf.leaves().items()})
-    assert_finite(found)
-    assert outputs[1].min() >= 0
-    assert outputs[1].max() <= 1
-
-    assert splats.ids is not None
-    assert_finite(step(variant, scene, splats.ids, splats.packed.grad))
-
-
-def step(
-    variant: Variant, scene: Scene, ids: Tensor, packed_grad: Tensor
-) -> dict[str, Tensor | None]:
-    """A first step of Adam: the parameters after it, and their first moments."""
-    stepped = scene.to(variant.dtype, requires_grad=False)
-    m = {name: torch.zeros_like(p) for name, p in stepped.params.items()}
-    v = {name: torch.zeros_like(p) for name, p in stepped.params.items()}
-    rates = AdamRates(dict.fromkeys(m, 1e-3), 1)
-    take_step(variant.ops, stepped, m, v, ids, packed_grad, rates)
-    return {**stepped.params, **{f"m of {name}": tensor for name, tensor in m.items()}}
 
 
 def assert_finite(tensors: dict[str, Tensor | None]) -> None:
@@ -122,74 +51,45 @@ def assert_finite(tensors: dict[str, Tensor | None]) -> None:
         assert tensor.isfinite().all(), f"{name} is not finite"
 
 
-@pytest.mark.parametrize(("name", "case"), SINGLE, ids=[case for _, case in SINGLE])
-def test_one_extreme_parameter(variant: Variant, name: str, case: str) -> None:
-    scene = random_scene(0, COUNT)
-    scene.params[name] = as_float32(wild(0)[case].double())
-    check(variant, scene)
+def extreme(shift: int, count: int) -> Extreme:
+    """Gaussians that have all extreme values, in other combinations for each ``shift``."""
+    values = (PLACES, SCALES, QUATS, OPACITIES, COLORS)
+    gaussians = [
+        tuple(kinds[(i + shift * k) % len(kinds)] for k, kinds in enumerate(values))
+        for i in range(count)
+    ]
+    size, focal = SIZES[shift % len(SIZES)], FOCALS[shift % len(FOCALS)]
+    return Extreme(shift, size, focal, shift % 4, tuple(gaussians))
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_extreme_parameters_together(variant: Variant, seed: int) -> None:
-    """Every parameter of every Gaussian is taken from a random case."""
-    scene, cases = random_scene(seed, COUNT), wild(seed)
-    g = generator(1000 + seed)
-    for name, listed in NAMES.items():
-        for case in listed.split():
-            taken = torch.rand(COUNT, generator=g) < 0.15
-            scene.params[name][taken] = as_float32(cases[case].double())[taken]
-    check(variant, scene)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", PARAMETERS)
-def test_nonfinite_gaussians_do_not_affect_others(
-    variant: Variant, name: str, value: float
-) -> None:
-    """Ids stay sorted and in range, and the results of all other Gaussians are bit-identical."""
-    clean, broken = random_scene(6, 130), random_scene(6, 130)
-    healthy = torch.ones(130, dtype=torch.bool)
-    healthy[::5] = False
-    for row in (~healthy).nonzero()[:, 0].tolist():
-        broken.params[name][row].view(-1)[row % broken.params[name][row].numel()] = value
-    found = []
-    for scene in (clean, broken):
-        leaf = scene.to(variant.dtype)
-        splats = leaf.project(variant.ops)
-        assert splats.ids is not None
-        ids = splats.ids.long()
-        assert ids.tolist() == sorted({i for i in ids.tolist() if 0 <= i < 130})
-        if math.isnan(value) and not name.startswith("sh"):
-            assert scene is clean or healthy[ids].all()
-        grad = normal(generator(2), 130, 16).to(variant.dtype)[ids]
-        splats.packed.backward(grad)
-        state = step(variant, scene, splats.ids, grad)
-        state.update({f"gradient of {n}": p.grad for n, p in leaf.params.items()})
-        rows = {n: t[healthy] for n, t in state.items() if t is not None}
-        found.append({"ids": ids[healthy[ids]], "packed": splats.packed[healthy[ids]], **rows})
-    for key, expected in found[0].items():
-        assert torch.equal(found[1][key], expected), key
+@pytest.mark.parametrize("shift", range(6))
+@pytest.mark.parametrize("check", [check_project, check_rasterize])
+def test_all_extreme_values(variant: Variant, check: Callable[..., None], shift: int) -> None:
+    """And images of any size. The random cases below are few, in particular of the emulation."""
+    check(variant, extreme(shift, len(PLACES)))
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_gaussian_or_one(variant: Variant, count: int) -> None:
-    check(variant, random_scene(3, count))
+    check_project(variant, extreme(0, count))
+    check_rasterize(variant, extreme(0, count))
 
 
 def test_no_gaussian_is_visible(variant: Variant) -> None:
     scene = random_scene(4, 20)
     scene.params["opacity_logits"][:] = -20.0
-    leaf = scene.to(variant.dtype)
-    splats = leaf.project(variant.ops)
+    splats = scene.to(variant.dtype).project(variant.ops)
     assert len(splats) == 0
     assert splats.ids is not None
     assert splats.ids.shape == (0,)
-    check(variant, scene)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (16, 16), (17, 31)])
-def test_any_image_size(variant: Variant, size: tuple[int, int]) -> None:
-    check(variant, random_scene(5, 30, *size))
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_nonfinite_gaussians_do_not_affect_others(variant: Variant, value: float) -> None:
+    """In each parameter; the results of all other Gaussians are bit-identical."""
+    for shift in range(3):
+        picks = [i % (len(PARAMETERS) + 1) for i in range(len(PLACES))]
+        check_harm(variant, extreme(shift, len(PLACES)), value, picks)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
