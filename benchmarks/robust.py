@@ -34,8 +34,7 @@ from snowsplat.synthetic.still_life import still_life
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.scenes.depth import depth_map
-from tests.scenes.passer_by import chosen_photos, passers_by
-from tests.scenes.shutter import shooting
+from tests.scenes.passer_by import chosen_photos, passers_by, shooting
 
 COUNT = 48
 SIZE = (400, 300)

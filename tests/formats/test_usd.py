@@ -184,6 +184,7 @@ def test_what_a_stage_says_of_its_splats(tmp_path: Path, caplog) -> None:
         assert text in caplog.text
 
 
+@pytest.mark.nightly  # to load the validators takes as long as all other tests of the formats
 @with_usd
 def test_the_validators_of_openusd(make_scene, tmp_path: Path) -> None:
     """All rules that its wheel has find nothing."""

@@ -13,7 +13,7 @@ from snowsplat.synthetic.scene import Scene
 def distances(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Distances (R,) float32 to the first hits along rays, in metres; infinite without a hit.
 
-    Glass is no hit. ``origins`` and ``directions``: see `Scene.radiance`.
+    ``origins`` and ``directions``: see `Scene.radiance`.
     """
     return scene.nearest(origins, directions, scene.candidates(origins, directions))[0]
 

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from torch import Tensor
 
 from snowsplat.scene.geometry import invert_rigid
 from snowsplat.synthetic import textures as paint
+from snowsplat.synthetic.lens import CentredLens
+from snowsplat.synthetic.photographer import RAYS, develop, tiles
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import FLOOR, LAMP
+
+from .depth import distances
 
 _DISTANCE = 1.25  # metres, from the centre of the table
 _SPREAD = 0.7  # radians, standard deviation of the direction from the centre
@@ -43,21 +47,46 @@ def _person(cam_from_world: Tensor, number: int, seed: int) -> Scene:
     x, y, _ = invert_rigid(cam_from_world)[:, 3].tolist()
     angle = math.atan2(-y, -x) + places.normal(0, _SPREAD)
     x, y = _DISTANCE * math.cos(angle), _DISTANCE * math.sin(angle)
-    return Scene(figure((x, y, FLOOR), clothes, (_TROUSERS, _SHIRT)), LAMP)
-
-
-def figure(
-    feet: tuple[float, float, float],
-    clothes: np.random.Generator,
-    colours: tuple[paint.Colour, paint.Colour],
-) -> list[SceneObject]:
-    """A person 1.7 m tall who stands at ``feet``; ``colours``: of the trousers and of the shirt."""
-    x, y, floor = feet
-    trousers = paint.plain((128, 64), colours[0], clothes)
-    stripes = paint.cloth((256, 128), 14, [colours[1], (0.85, 0.82, 0.75)], clothes)
+    trousers = paint.plain((128, 64), _TROUSERS, clothes)
+    stripes = paint.cloth((256, 128), 14, [_SHIRT, (0.85, 0.82, 0.75)], clothes)
     head = paint.plain((64, 64), _SKIN, clothes, stains=0.4)
-    return [
-        SceneObject(Frustum((x, y, floor), 0.80, 0.13, 0.17), [trousers]),
-        SceneObject(Frustum((x, y, floor + 0.80), 0.62, 0.17, 0.22), [stripes]),
-        SceneObject(Ellipsoid((x, y, floor + 1.60), (0.10, 0.10, 0.13)), [head]),
+    figure = [  # 1.7 m tall
+        SceneObject(Frustum((x, y, FLOOR), 0.80, 0.13, 0.17), [trousers]),
+        SceneObject(Frustum((x, y, FLOOR + 0.80), 0.62, 0.17, 0.22), [stripes]),
+        SceneObject(Ellipsoid((x, y, FLOOR + 1.60), (0.10, 0.10, 0.13)), [head]),
     ]
+    return Scene(figure, LAMP)
+
+
+def photograph(
+    scene: Scene,
+    lens: CentredLens,
+    cam_from_world: Tensor,
+    random: np.random.Generator,
+    passing: Scene | None = None,
+) -> np.ndarray:
+    """`snowsplat.synthetic.photographer.photograph` with someone who passes.
+
+    ``passing``: more objects, which cast no shadow on the scene.
+    """
+    world_from_cam = invert_rigid(cam_from_world).numpy()
+    rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
+    spread = 1 / (lens.focal * RAYS)
+    light = np.empty((lens.height, lens.width, 3), np.float32)
+    for rows, columns, rays in tiles(lens):
+        directions = rotation @ rays
+        found = scene.radiance(origin, directions, spread)
+        if passing is not None:
+            near = distances(passing, origin, directions) < distances(scene, origin, directions)
+            found = np.where(near, passing.radiance(origin, directions, spread), found)
+        shape = (3, rows.stop - rows.start, RAYS, columns.stop - columns.start, RAYS)
+        pixels = found.clip(0, 1).reshape(shape).mean(axis=(2, 4))
+        light[rows, columns] = pixels.transpose(1, 2, 0)
+    return develop(light, random)
+
+
+def shooting(
+    lens: CentredLens, poses: Sequence[Tensor], passing: Mapping[int, Scene]
+) -> Callable[[Scene, int, np.random.Generator], np.ndarray]:
+    """For `take_photos`; ``passing``: who is in only one photo, by the index of its pose."""
+    return lambda scene, i, random: photograph(scene, lens, poses[i], random, passing.get(i))

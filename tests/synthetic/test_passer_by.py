@@ -9,8 +9,7 @@ from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box
 
 from ..scenes.depth import depth_map
-from ..scenes.passer_by import chosen_photos, passers_by
-from ..scenes.shutter import photograph
+from ..scenes.passer_by import chosen_photos, passers_by, photograph
 
 LENS = phone_lens(80, 60, distortion=(0.0, 0.0, 0.0, 0.0))
 

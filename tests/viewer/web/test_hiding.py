@@ -21,7 +21,6 @@ from ...browser import Browser, Page
 
 WIDTH, HEIGHT = 480, 360
 SLIDERS = "[...document.querySelectorAll('.snow-hiding input')]"
-SHOWN = "window.sse.viewer.state.loaded"
 
 
 def blobs(means: list[list[float]], sizes: list[float]) -> Gaussians:
