@@ -115,34 +115,10 @@ def test_a_hard_part_of_the_scene_does_not_stand_out():
 
 def test_a_view_that_is_explained_a_little_less_does_not_stand_out():
     psnr, explained = usual()
-    psnr[WRONG], explained[WRONG] = 12.0, 0.7
-    assert standing_out(psnr, explained - 0.1, *ring()) == ()
-    assert standing_out(psnr, explained - 0.1 * (np.arange(COUNT) == WRONG) - 0.08, *ring()) == (
-        WRONG,
-    )
-
-
-def test_a_view_whose_psnr_is_hardly_worse_does_not_stand_out():
-    psnr, explained = usual()
-    psnr[WRONG], explained[WRONG] = 16.0, 0.2
-    assert standing_out(psnr - 6.0 * (np.arange(COUNT) != WRONG), explained, *ring()) == ()
-
-
-def test_a_view_does_not_stand_out_if_views_differ_much_in_general():
-    psnr, explained = usual()
-    psnr[WRONG], explained[WRONG] = 12.0, 0.4
-    assert standing_out(psnr, explained, *ring()) == (WRONG,)
-    explained[::3] -= 0.25
-    explained[2::3] -= 0.12
+    psnr[WRONG], explained[WRONG] = 12.0, 0.65
     assert standing_out(psnr, explained, *ring()) == ()
-
-
-def test_a_view_that_is_explained_does_not_stand_out():
-    """For example, a close photo with much detail."""
-    psnr, explained = usual()
-    psnr[WRONG], explained[WRONG] = 12.0, 0.6
-    assert standing_out(psnr, explained + 0.06, *ring()) == ()
-    assert standing_out(psnr, explained + 0.04, *ring()) == (WRONG,)
+    explained[WRONG] = 0.55
+    assert standing_out(psnr, explained, *ring()) == (WRONG,)
 
 
 def test_a_flat_photo_does_not_stand_out():
@@ -160,13 +136,6 @@ def test_a_photo_of_low_contrast_does_not_stand_out():
     assert standing_out(psnr, explained, *ring()) == ()
     psnr[WRONG] = 19.5
     assert standing_out(psnr, explained, *ring()) == (WRONG,)
-
-
-def test_no_view_stands_out_from_views_that_are_not_explained():
-    psnr, explained = usual()
-    psnr[WRONG], explained[WRONG] = 12.0, 0.0
-    assert standing_out(psnr, 0.6 * explained, *ring()) == ()
-    assert standing_out(psnr, 0.75 * explained, *ring()) == (WRONG,)
 
 
 def test_no_view_stands_out_if_there_are_few_or_if_many_would():

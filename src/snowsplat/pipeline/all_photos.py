@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 
@@ -18,6 +19,7 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import render
 from snowsplat.training.core.history import History
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
@@ -87,6 +89,7 @@ def train_on_all(
             images,
             background=background,
             sh_degree=scene.gaussians.sh_degree,
+            render=partial(render, with_depth=True),
         )
     views = [view for i, view in enumerate(views) if i < len(used) or i not in wrong]
     exposures = folder.exposures()
