@@ -17,7 +17,7 @@ from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.synthetic import Truth, write_synthetic_photos
 from snowsplat.synthetic.compare_poses import PoseErrors, compare_poses
-from snowsplat.util.errors import UserError
+from snowsplat.util.files import check_output
 from snowsplat.util.stages import Outcome
 
 PHOTOS, TRUTH, MADE = "photos", "truth", "made"
@@ -54,7 +54,7 @@ def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
         TrainingStopped, KeyboardInterrupt: Ctrl-C. Finished photos and stages are kept.
     """
     out = Path(output)
-    _check_free(out)
+    check_output(out, lambda entry: entry.name in (PHOTOS, TRUTH, MADE))
     truth = _take_photos(out / PHOTOS, observer)
     truth.write(out / TRUTH)
     made = make(out / PHOTOS, out / MADE, _OPTIONS, observer=observer)
@@ -63,13 +63,6 @@ def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
     poses = {name: pose for name, pose in truth.poses.items() if name in used}
     errors = compare_with_truth(made.dataset, poses)
     return DemoResult(out / PHOTOS, out / TRUTH, made, errors)
-
-
-def _check_free(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise UserError("{out}: is a file; use a folder for the output", out=out)
-    if out.is_dir() and not {path.name for path in out.iterdir()} <= {PHOTOS, TRUTH, MADE}:
-        raise UserError("{out}: contains other files; use a new or an empty folder", out=out)
 
 
 def _take_photos(folder: Path, observer: Observer) -> Truth:

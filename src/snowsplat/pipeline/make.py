@@ -47,7 +47,7 @@ from snowsplat.training.core import checkpoint
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import SettingError, UserError
-from snowsplat.util.files import atomic_path, remove_temporaries
+from snowsplat.util.files import atomic_path, check_output, remove_temporaries
 from snowsplat.util.messages import message
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json
@@ -137,9 +137,7 @@ def make(
 def _check_free(out: Path) -> None:
     """Raises UserError if the folder contains files that `make` has not written."""
     remove_temporaries(out, (MAKE_RECORD,))
-    others = any(entry.name != LOCK for entry in out.iterdir())
-    if others and not (out / MAKE_RECORD).is_file():
-        raise UserError("{out}: contains other files; use a new or an empty folder", out=out)
+    check_output(out, lambda entry: entry.name == LOCK or (out / MAKE_RECORD).is_file())
 
 
 @contextmanager

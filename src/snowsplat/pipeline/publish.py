@@ -16,6 +16,7 @@ from snowsplat.project.project import Project
 from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import check_output
 from snowsplat.util.messages import message
 from snowsplat.viewer.web.panel import Description, made_on
 from snowsplat.viewer.web.publication import SCENE, is_site, write_one_file, write_site
@@ -63,8 +64,11 @@ def publish(
         OSError: a file cannot be written.
     """
     options, folder = options or PublishOptions(), Path(folder)
-    if folder.exists():
-        _check_free(folder, overwrite)
+    check_output(folder, lambda _: is_site(folder))
+    if not overwrite and is_site(folder):
+        raise UserError(
+            "{folder}: already contains a web site; use `overwrite` to replace it", folder=folder
+        )
     Compute("cpu", threads).apply()
     with observer.waiting("reading"):
         project = Project.open(scene, iteration)
@@ -99,17 +103,3 @@ def _write_levels(observer: Observer, folder: Path, gaussians: Gaussians) -> str
     write_levels(folder / INDEX, gaussians, observer)
     (folder / SCENE).unlink(missing_ok=True)
     return INDEX
-
-
-def _check_free(folder: Path, overwrite: bool) -> None:
-    if not folder.is_dir():
-        raise UserError("{folder}: is a file; use a folder for the output", folder=folder)
-    names = [entry.name for entry in folder.iterdir()]
-    if names and not is_site(folder):
-        raise UserError(
-            "{folder}: contains other files; use a new or an empty folder", folder=folder
-        )
-    if names and not overwrite:
-        raise UserError(
-            "{folder}: already contains a web site; use `overwrite` to replace it", folder=folder
-        )

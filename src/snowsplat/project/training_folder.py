@@ -41,6 +41,7 @@ from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import (
     atomic_path,
+    check_output,
     is_temporary,
     remove_temporaries,
     write_json,
@@ -148,20 +149,11 @@ class TrainingFolder:
             UserError: the path is a file or a folder with other files, or contains a training run
                 that is to be neither resumed nor overwritten.
         """
-        if not self.path.exists():
-            return
-        if not self.path.is_dir():
-            raise UserError("{path}: is a file; use a folder for the output", path=self.path)
-        others = (
-            entry
-            for entry in self.path.iterdir()
-            if entry.name != LOCK and not is_temporary(entry, self.FILES)
+        found = self.is_training()
+        check_output(
+            self.path, lambda entry: found or entry.name == LOCK or is_temporary(entry, self.FILES)
         )
-        if any(others) and not self.is_training():
-            raise UserError(
-                "{path}: contains other files; use a new or an empty folder", path=self.path
-            )
-        if self.is_training() and not resume and not overwrite:
+        if found and not resume and not overwrite:
             raise UserError(
                 "{path}: already contains a training run; use `resume` to continue it, "
                 "`overwrite` to replace it, or use another folder",

@@ -167,6 +167,17 @@ def check_target(path: Path, overwrite: bool) -> None:
         raise UserError("{path}: exists; use `overwrite` to replace it", path=path)
 
 
+def check_output(folder: Path, known: Callable[[Path], bool]) -> None:
+    """Raises UserError: results may not be written into this folder, which need not exist: it is a
+    file, or has an entry that is not ``known``."""
+    if folder.exists() and not folder.is_dir():
+        raise UserError("{folder}: is a file; use a folder for the output", folder=folder)
+    if folder.is_dir() and not all(map(known, folder.iterdir())):
+        raise UserError(
+            "{folder}: contains other files; use a new or an empty folder", folder=folder
+        )
+
+
 def is_temporary(path: Path, names: Collection[str]) -> bool:
     """Whether ``path`` is a temporary file of `atomic_path` for a file with one of ``names``."""
     match = _TEMPORARY.fullmatch(path.name)

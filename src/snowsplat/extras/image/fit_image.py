@@ -26,7 +26,7 @@ from snowsplat.scene.pixels import to_8bit
 from snowsplat.training.core.progress import Progress
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import write_json
+from snowsplat.util.files import check_output, write_json
 from snowsplat.util.messages import message
 from snowsplat.util.process import single_threaded
 from snowsplat.util.settings import Setting, checked
@@ -97,8 +97,7 @@ def fit_image(
     """
     options, photo, output = options or FitOptions(), Path(photo), Path(output)
     checked("size", size, int, _SIZE)
-    if output.exists() and not output.is_dir():
-        raise UserError("{output}: is a file; use a folder for the output", output=output)
+    check_output(output, lambda _: True)
     if (output / "metrics.json").exists() and not overwrite:
         raise UserError(
             "{output}: contains an earlier fit; use `overwrite` to replace it", output=output

@@ -15,8 +15,9 @@ from snowsplat.formats.lod import INDEX
 from snowsplat.formats.lod_writer import remove_lod
 from snowsplat.formats.sog import write_sog
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.pixels import to_8bit
 from snowsplat.scene.render import render
-from snowsplat.util.files import atomic_path, write_text
+from snowsplat.util.files import write_bytes, write_text
 from snowsplat.viewer.http.static import Served, served
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import PICTURES, ReadyScene
@@ -55,9 +56,9 @@ def write_site(
     content = write_scene(folder, scene.gaussians)
     if content == INDEX:
         scene = scene.complete()
-    _write(folder / POSTER, _poster(scene))
+    write_bytes(folder / POSTER, _poster(scene))
     if scene.stops.views:
-        _write(folder / PICTURES, scene.stops.pictures)
+        write_bytes(folder / PICTURES, scene.stops.pictures)
     else:
         (folder / PICTURES).unlink(missing_ok=True)  # of an earlier site
     for name in ("index.css", "index.js"):
@@ -109,18 +110,12 @@ def _tags(properties: Mapping[str, str]) -> str:
     )
 
 
-def _write(file: Path, content: bytes) -> None:
-    with atomic_path(file) as temporary:
-        temporary.write_bytes(content)
-
-
 def _poster(scene: ReadyScene) -> bytes:
     """The initial view as a JPEG file."""
     camera = scene.start.camera(*POSTER_SIZE)
     with torch.no_grad():
         shown = scene.hiding.shown(scene.gaussians.detach())
         image = render(shown, camera, torch.tensor(scene.background)).image
-    pixels = image.clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
     file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "JPEG", quality=88)
+    Image.fromarray(to_8bit(image)).save(file, "JPEG", quality=88)
     return file.getvalue()

@@ -22,6 +22,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import transform_points
 from snowsplat.scene.initial_view import InitialView, bounding_sphere, view_of_camera
+from snowsplat.scene.pixels import to_8bit
 from snowsplat.scene.render import render
 from snowsplat.trajectory.focus import focus_of, positions_of
 
@@ -82,7 +83,6 @@ def _look(
     with torch.no_grad():
         output = render(gaussians.detach(), camera, torch.tensor(background), with_depth=True)
     assert output.depth is not None
-    pixels = output.image.clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
     rows = torch.arange(camera.height, dtype=torch.float64)[:, None] + 0.5 - camera.cy
     columns = torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx
     middle = (rows.abs() < _MIDDLE / 2 * camera.height) & (
@@ -91,7 +91,7 @@ def _look(
     alpha = output.alpha.double()
     z = output.depth.double() / alpha
     points = torch.stack([columns / camera.fx * z, rows / camera.fy * z, z], -1)
-    return Image.fromarray(pixels), transform_points(
+    return Image.fromarray(to_8bit(output.image)), transform_points(
         camera.world_from_cam, points[middle & (alpha > 0.5)]
     )
 
