@@ -31,7 +31,7 @@ from snowsplat.training.parts.direction_cells import (
     regions_of,
     spread_of,
 )
-from snowsplat.training.parts.found_sky import find_sky, sky_distance
+from snowsplat.training.parts.found_sky import Sky, find_sky, sky_distance
 from snowsplat.training.parts.sky import INTERVAL, SkyPart
 from snowsplat.training.settings import changed
 from snowsplat.training.settings.recipes import recipe
@@ -125,6 +125,11 @@ def images(data: Dataset) -> ImageLoader:
     return ImageLoader(data.train, budget_bytes=1 << 26)
 
 
+@pytest.fixture(scope="module")
+def sky(outdoors) -> Sky | None:
+    return find_sky(outdoors, images(outdoors))
+
+
 def test_the_middle_of_a_cell_is_in_it_and_cells_are_of_similar_size():
     cells = torch.arange(COUNT)
     directions = directions_of(cells)
@@ -158,8 +163,7 @@ def test_medians_and_spreads_of_cells():
     assert spread[5] == pytest.approx(math.sqrt(2.0))
 
 
-def test_the_sky_is_found_with_its_colours(outdoors):
-    sky = find_sky(outdoors, images(outdoors))
+def test_the_sky_is_found_with_its_colours(sky):
     assert sky is not None
     above = sky.directions[:, 1] < ANGLE
     assert float(above.float().mean()) > 0.99
@@ -170,8 +174,7 @@ def test_the_sky_is_found_with_its_colours(outdoors):
     assert 0.2 < sky.share < 0.5  # half of the photos is above the horizon; points are near it
 
 
-def test_points_in_the_sky(outdoors):
-    sky = find_sky(outdoors, images(outdoors))
+def test_points_in_the_sky(outdoors, sky):
     points = sky.points(500)
     assert 250 < len(points) <= 500
     distance = points.xyz.norm(dim=1)
@@ -181,8 +184,7 @@ def test_points_in_the_sky(outdoors):
     assert float(chosen.points(500).xyz.norm(dim=1).max()) == pytest.approx(37.0, rel=1e-4)
 
 
-def test_what_is_before_the_sky_is_known(outdoors):
-    sky = find_sky(outdoors, images(outdoors))
+def test_what_is_before_the_sky_is_known(outdoors, sky):
     assert sky.is_before(EMPTY).all()
     assert not sky.is_before(outdoors.points.xyz).any()
     assert not sky.is_before(sky.points(500).xyz).any()
@@ -206,8 +208,7 @@ def test_a_wire_before_the_sky_is_kept(tmp_path):
     assert sky.is_before(EMPTY[1:]).all()
 
 
-def test_the_limit_removes_gaussians_before_the_sky(outdoors):
-    sky = find_sky(outdoors, images(outdoors))
+def test_the_limit_removes_gaussians_before_the_sky(outdoors, sky):
     means = torch.cat([EMPTY, outdoors.points.xyz[:4], sky.points(5).xyz])
     bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     gaussians = gaussians_in_box(bounds, len(means), torch.Generator().manual_seed(5))
@@ -271,7 +272,7 @@ def test_below_the_horizon_is_no_sky(tmp_path, outdoors):
     assert find_sky(data, images(data)) is None
 
 
-def test_the_sky_does_not_depend_on_the_frame_and_unit_of_the_world(outdoors):
+def test_the_sky_does_not_depend_on_the_frame_and_unit_of_the_world(outdoors, sky):
     turn = rotation_from_quat(torch.tensor([0.6, -0.4, 0.5, 0.48], dtype=torch.float64))
     scale = 1000.0
     shift = torch.tensor([3e5, -2e5, 1e4], dtype=torch.float64)
@@ -285,7 +286,6 @@ def test_the_sky_does_not_depend_on_the_frame_and_unit_of_the_world(outdoors):
     moved = replace(
         outdoors, train=views, points=Points(points.float(), outdoors.points.rgb), extent=2200.0
     )
-    sky = find_sky(outdoors, images(outdoors))
     other = find_sky(moved, images(moved))
     assert other.share == pytest.approx(sky.share, rel=0.05)
     up = turn @ torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
