@@ -219,37 +219,24 @@ def read_points(path: Path) -> PointFile:
     return PointFile(records["xyz"], records["rgb"], ids, track_rows(tracks))
 
 
-def write_model(
-    folder: Path,
-    cameras: Mapping[int, Lens],
-    images: Sequence[ColmapImage],
-    xyz: np.ndarray,
-    rgb: np.ndarray,
-    tracks: Sequence[Sequence[tuple[int, int]]],
-) -> None:
-    """Write cameras.bin, images.bin and points3D.bin; see `model.write_model` for the arguments."""
-    camera_records = [
-        _CAMERA_HEAD.pack(key, COLMAP_MODELS.index(camera.kind), camera.width, camera.height)
-        + struct.pack(f"<{len(camera.params)}d", *camera.params)
-        for key, camera in cameras.items()
-    ]
-    image_records = [
-        _IMAGE_HEAD.pack(number, *image.pose, image.camera_id)
-        + image.name.encode("utf-8", errors="surrogateescape")
-        + b"\0"
-        + _COUNT.pack(0)  # no observations
-        for number, image in enumerate(images, 1)
-    ]
-    rows = zip(xyz.tolist(), rgb.tolist(), tracks, strict=True)
-    point_records = [
-        struct.pack("<Q3d3BdQ", number, *position, *color, 0.0, len(track))
-        + b"".join(struct.pack("<II", *pair) for pair in track)
-        for number, (position, color, track) in enumerate(rows, 1)
-    ]
-    _write(folder / "cameras.bin", camera_records)
-    _write(folder / "images.bin", image_records)
-    _write(folder / "points3D.bin", point_records)
+def camera_record(number: int, camera: Lens) -> bytes:
+    head = number, COLMAP_MODELS.index(camera.kind), camera.width, camera.height
+    return _CAMERA_HEAD.pack(*head) + struct.pack(f"<{len(camera.params)}d", *camera.params)
 
 
-def _write(path: Path, records: list[bytes]) -> None:
+def image_record(number: int, image: ColmapImage) -> bytes:
+    """Of an image without observations."""
+    name = image.name.encode("utf-8", errors="surrogateescape") + b"\0"
+    return _IMAGE_HEAD.pack(number, *image.pose, image.camera_id) + name + _COUNT.pack(0)
+
+
+def point_record(
+    number: int, position: list[float], colour: list[int], track: Sequence[tuple[int, int]]
+) -> bytes:
+    head = struct.pack("<Q3d3BdQ", number, *position, *colour, 0.0, len(track))
+    return head + b"".join(struct.pack("<II", *pair) for pair in track)
+
+
+def write_records(path: Path, records: list[bytes]) -> None:
+    """Write cameras.bin, images.bin or points3D.bin."""
     path.write_bytes(_COUNT.pack(len(records)) + b"".join(records))

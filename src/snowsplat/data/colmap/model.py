@@ -144,7 +144,15 @@ def write_model(
     """
     folder.mkdir(parents=True, exist_ok=True)
     tracks = [()] * len(xyz) if tracks is None else tracks
-    _FILES[text][0].write_model(folder, cameras, images, xyz, rgb, tracks)
+    files, suffix = _FILES[text]
+    points = zip(xyz.tolist(), rgb.tolist(), tracks, strict=True)
+    records = {
+        "cameras": [files.camera_record(*each) for each in cameras.items()],
+        "images": [files.image_record(*each) for each in enumerate(images, 1)],
+        "points3D": [files.point_record(i, *each) for i, each in enumerate(points, 1)],
+    }
+    for name, of_name in records.items():
+        files.write_records(folder / f"{name}{suffix}", of_name)
 
 
 def write_posed(

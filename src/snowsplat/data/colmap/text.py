@@ -259,35 +259,26 @@ def _points_without_tracks(path: Path, tracks: dict[int, str]) -> Iterator[str]:
         yield " ".join(words[:7])
 
 
-def write_model(
-    folder: Path,
-    cameras: Mapping[int, Lens],
-    images: Sequence[ColmapImage],
-    xyz: np.ndarray,
-    rgb: np.ndarray,
-    tracks: Sequence[Sequence[tuple[int, int]]],
-) -> None:
-    """Write cameras.txt, images.txt and points3D.txt; see `model.write_model` for the arguments."""
-    # repr() of a float is the shortest text that reads back as the same number.
-    camera_lines = [
-        " ".join(map(str, (key, camera.model, camera.width, camera.height, *camera.params)))
-        for key, camera in cameras.items()
-    ]
-    image_lines = [
-        " ".join(map(str, (number, *image.pose, image.camera_id, image.name)))
-        + "\n"  # the line of observations, empty
-        for number, image in enumerate(images, 1)
-    ]
-    rows = zip(xyz.tolist(), rgb.tolist(), tracks, strict=True)
-    point_lines = [
-        " ".join(map(str, (number, *position, *color, 0.0, *sum(track, ()))))
-        for number, (position, color, track) in enumerate(rows, 1)
-    ]
-    _write(folder / "cameras.txt", "cameras", camera_lines)
-    _write(folder / "images.txt", "images", image_lines)
-    _write(folder / "points3D.txt", "points", point_lines)
+# str() of a float is the shortest text that reads back as the same number.
 
 
-def _write(path: Path, kind: str, lines: list[str]) -> None:
-    text = "\n".join([f"# Number of {kind}: {len(lines)}", *lines, ""])
+def camera_record(number: int, camera: Lens) -> str:
+    return " ".join(map(str, (number, camera.model, camera.width, camera.height, *camera.params)))
+
+
+def image_record(number: int, image: ColmapImage) -> str:
+    """Of an image without observations: their line is empty."""
+    return " ".join(map(str, (number, *image.pose, image.camera_id, image.name))) + "\n"
+
+
+def point_record(
+    number: int, position: list[float], colour: list[int], track: Sequence[tuple[int, int]]
+) -> str:
+    return " ".join(map(str, (number, *position, *colour, 0.0, *sum(track, ()))))
+
+
+def write_records(path: Path, records: list[str]) -> None:
+    """Write cameras.txt, images.txt or points3D.txt."""
+    kind = path.stem.removesuffix("3D")
+    text = "\n".join([f"# Number of {kind}: {len(records)}", *records, ""])
     path.write_text(text, encoding="utf-8")
