@@ -233,6 +233,20 @@ def test_cmake_without_a_compiler_names_the_package_to_install(tmp_path, bare_pa
     assert NO_COMPILER in [line.strip() for line in result.stderr.splitlines()]
 
 
+def test_cmake_with_the_compiler_of_windows_names_clang(tmp_path):
+    """CMake takes this one for MSVC, which was not seen itself."""
+    compiler, cmake = tmp_path / "cl", Path(sys.executable).parent / "cmake"
+    if not cmake.exists() or shutil.which("g++") is None:
+        pytest.skip("needs cmake (make dev installs it) and g++")
+    looks = "-U__GNUC__ -U__GNUG__ -D_MSC_VER=1930 -D_MSC_FULL_VER=193030000"
+    compiler.write_text(f'#!/bin/sh\nexec g++ {looks} "$@"\n')
+    compiler.chmod(0o755)
+    environment = {**os.environ, "CXX": str(compiler)}
+    result = run(cmake, "-S", REPOSITORY, "-B", tmp_path / "build", env=environment)
+    assert result.returncode != 0
+    assert f"snowsplat: {compiler} cannot build the kernels; install Clang" in result.stderr
+
+
 def test_make_without_a_compiler_names_the_package_to_install(bare_path):
     command = [f"{bare_path}/make", "--no-print-directory", f"PYTHON={bare_path}/python", "native"]
     result = run(*command, cwd=REPOSITORY, env={"PATH": bare_path})

@@ -15,10 +15,11 @@ from PIL import Image
 from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.project.site_folder import SiteFolder
 
 from ..browser import Browser
 
-FILES = ["index.css", "index.html", "index.js", "poster.jpg", "scene.sog", "viewer-licence.txt"]
+FILES = ["index.css", "index.js", "poster.jpg", "scene.sog", "viewer-licence.txt"]
 
 
 @pytest.fixture(scope="module")
@@ -39,14 +40,16 @@ def site(scene, tmp_path_factory):
     options = PublishOptions("A <box>", "CC BY 4.0", "https://example.org/box")
     result = publish(scene, folder, options)
     assert result.gaussians == 1500
-    assert result.bytes == sum(file.stat().st_size for file in folder.iterdir())
+    assert result.bytes == sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
     return folder
 
 
 def test_files(site, scene):
-    assert sorted(file.name for file in site.iterdir()) == FILES
-    assert len(read_gaussians(site / "scene.sog")) == 1500
-    poster = np.asarray(Image.open(site / "poster.jpg"))
+    files = SiteFolder(site).scene().parent
+    assert {path.name for path in site.iterdir()} == {"index.html", files.name}
+    assert sorted(file.name for file in files.iterdir()) == FILES
+    assert len(read_gaussians(files / "scene.sog")) == 1500
+    poster = np.asarray(Image.open(files / "poster.jpg"))
     assert poster.shape == (630, 1200, 3)
     assert poster[:, 560:640].std() > 20  # the box is in the middle, before a black background
     assert poster[:, :40].max() < 20
@@ -56,7 +59,8 @@ def test_page(site):
     text = (site / "index.html").read_text(encoding="utf-8")
     tags = dict(re.findall(r'<meta property="([^"]+)" content="([^"]*)"', text))
     assert unescape(tags["og:title"]) == "A <box>"
-    assert tags["og:image"] == "https://example.org/box/poster.jpg"
+    files = SiteFolder(site).scene().parent.name
+    assert tags["og:image"] == f"https://example.org/box/{files}/poster.jpg"
     assert tags["og:url"] == "https://example.org/box/"
     assert re.search(r"A scene in 3D: 1,500 Gaussians · \d{4}-\d\d-\d\d · CC BY", text)
     assert "A <box>" not in text
@@ -81,7 +85,7 @@ def test_a_site_that_cannot_be_loaded_says_what_to_do(site, tmp_path, missing, t
     with contextlib.ExitStack() as stack:
         url = (folder / "index.html").as_uri()
         if missing:
-            (folder / missing).unlink()
+            SiteFolder(folder).scene().with_name(missing).unlink()
             url = stack.enter_context(_served(folder))
         page = stack.enter_context(Browser(480, 360)).open(f"{url}?webgl")
         lines = page.wait_for("document.querySelector('.snow-failure')?.innerText").splitlines()
@@ -121,7 +125,7 @@ def test_overwrite(run, refused, scene, tmp_path):
     assert f"{folder}: 1,500 Gaussians" in result.out
     text = (folder / "index.html").read_text(encoding="utf-8")
     assert "<title>box</title>" in text
-    assert 'og:image" content="poster.jpg"' in text
+    assert re.search(r'og:image" content="files-\w+/poster.jpg"', text)
     assert "og:url" not in text
     assert "--overwrite" in refused("publish", scene, "-o", folder)
     assert run("publish", scene, "-o", folder, "--overwrite", "--title", "B").code == 0
@@ -138,12 +142,12 @@ def test_a_large_scene_is_published_in_levels(scene, tmp_path, monkeypatch):
         result = module.publish(scene, folder, overwrite=True)
     files = [file for file in folder.rglob("*") if file.is_file()]
     assert result.bytes == sum(file.stat().st_size for file in files)
-    assert not (folder / "scene.sog").exists()
-    assert len(read_gaussians(folder / "lod-meta.json")) == 1500
-    page = (folder / "index.html").read_text(encoding="utf-8")
-    assert '"contentUrl": "./lod-meta.json"' in page
+    assert SiteFolder(folder).content().name == "lod-meta.json"
+    assert len(read_gaussians(SiteFolder(folder).content())) == 1500
     module.publish(scene, folder, overwrite=True)
-    assert sorted(file.name for file in folder.iterdir()) == FILES
+    files = SiteFolder(folder).scene().parent
+    assert {path.name for path in folder.iterdir()} == {"index.html", files.name}
+    assert sorted(file.name for file in files.iterdir()) == FILES
 
 
 def test_errors(refused, scene, tmp_path):

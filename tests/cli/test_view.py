@@ -15,6 +15,7 @@ from snowsplat.cli import page_flags
 from snowsplat.cli.main import main
 from snowsplat.cli.pages import for_other_computers, opener_of
 from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.project.site_folder import SiteFolder
 
 from ..browser import Browser
 
@@ -175,12 +176,11 @@ def test_a_published_site_is_served_as_it_is(start, out, tmp_path, monkeypatch, 
     process = start("view", site, "--no-browser")
     assert process.stdout.readline() == f"{site / 'index.html'}: a web site\n"
     url = address(process.stdout.readline())
-    for file in (
-        "index.html",
-        "index.js",
-        "poster.jpg",
-        "lod-meta.json" if levels else "scene.sog",
-    ):
+    content = SiteFolder(site).content()
+    assert content.name == ("lod-meta.json" if levels else "scene.sog")
+    loaded = [content.with_name(name) for name in ("index.js", "poster.jpg", content.name)]
+    for path in (site / "index.html", *loaded):
+        file = path.relative_to(site).as_posix()
         with urllib.request.urlopen(url + file, timeout=10) as response:
             assert response.read() == (site / file).read_bytes()
     with urllib.request.urlopen(url, timeout=10) as page:

@@ -8,6 +8,7 @@ the correct result.
 
 from __future__ import annotations
 
+import base64
 import fcntl
 import hashlib
 import json
@@ -23,6 +24,7 @@ import sys
 import termios
 import threading
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -39,11 +41,16 @@ import snowsplat
 from snowsplat.data.colmap.model import read_model, read_points
 from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.formats import read_gaussians
+from snowsplat.project.edit_record import PageEdit
+from snowsplat.project.site_folder import SiteFolder
+from snowsplat.project.studio_scene import StudioScene
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.training.core import checkpoint
 from snowsplat.util.ply import open_table
 from snowsplat.util.run_lock import LOCK
+
+from .watched_command import STUDIO
 
 _MOST_DEFECTS = 20
 _SOURCE = str(Path(snowsplat.__file__).parents[1])
@@ -238,12 +245,17 @@ def _open(path: Path) -> None:
         json.loads(path.read_text(encoding="utf-8"))
     elif path.suffix == ".safetensors":
         checkpoint.load(path)
+    elif path.suffix in (".css", ".js", ".txt") or name == "CNAME":
+        assert path.stat().st_size
+    elif path.suffix == ".zip":
+        with zipfile.ZipFile(path) as archive:
+            assert archive.testzip() is None
     elif path.suffix == ".html":
         assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
     elif name in ("input.ply", "points3D.ply"):
         for _ in open_table(path).rows():
             pass
-    elif path.suffix in (".png", ".jpg"):
+    elif path.suffix in (".png", ".jpg", ".webp"):
         with Image.open(path) as image:
             image.load()
     else:
@@ -453,6 +465,177 @@ def convert_jobs(scene: Path, other: Path) -> list[Job]:
     return [job(suffix) for suffix in targets]
 
 
+def site_digests(folder: Path) -> dict[str, str]:
+    """The files of the site in a folder by their names; empty if there is none."""
+    content = SiteFolder(folder).content()
+    if content is None:
+        return {}
+    loaded = [path for path in content.parent.rglob("*") if path.is_file()]
+    files = [folder / "index.html", *loaded]
+    return {str(file.relative_to(folder)): digest(file) for file in files}
+
+
+def publish_jobs(scene: Path, other: Path) -> list[Job]:
+    """Publish into a new folder, over another site, and in levels of detail."""
+
+    def publish(file: Path, output: Path, *more: object) -> list[object]:
+        return ["publish", file, "-o", output, "--title", file.stem, *more]
+
+    def older_site(folder: Path) -> None:
+        run_command(publish(other, folder))
+        (folder / "CNAME").write_text("example.org")  # of its owner
+
+    def older(output: Path) -> None:
+        copy_prepared("older site", older_site, output)
+
+    def check_killed(output: Path, whole: Path) -> None:
+        old = whole.parents[1] / "older site"
+        before = site_digests(old) if (output / "CNAME").exists() else {}
+        if site_digests(output) not in (before, site_digests(whole)):
+            raise Defect("neither the old site nor the new one")
+
+    def check_done(output: Path, whole: Path) -> None:
+        if site_digests(output) != site_digests(whole) or names_in(output) != names_in(whole):
+            raise Defect("not the site of an undisturbed run")
+
+    def new(output: Path, again: bool) -> list[object]:
+        return publish(scene, output, *(["--overwrite"] * again))
+
+    def over(output: Path, _: bool) -> list[object]:
+        return publish(scene, output, "--overwrite")
+
+    def levels(output: Path, _: bool) -> list[object]:
+        return ["convert", scene, output / "lod-meta.json", "--overwrite"]
+
+    def older_levels(output: Path) -> None:
+        command = ["convert", other]
+        copy_prepared(
+            "older levels", lambda to: run_command([*command, to / "lod-meta.json"]), output
+        )
+
+    def check_levels(output: Path, whole: Path) -> None:
+        count = len(read_gaussians(output / "lod-meta.json"))
+        if count not in (len(read_gaussians(other)), len(read_gaussians(whole / "lod-meta.json"))):
+            raise Defect("neither the old levels nor the new ones")
+
+    def check_new_levels(output: Path, whole: Path) -> None:
+        check_levels(whole, output)
+        if len(names_in(output)) != len(names_in(whole)):
+            raise Defect("files are left")
+
+    site = ("publish", "site")
+    return [
+        Job("publish", *site, new, check_done, check_killed=check_killed),
+        Job("publish --overwrite", *site, over, check_done, older, check_killed),
+        Job("publish levels", *site, levels, check_new_levels, older_levels, check_levels),
+    ]
+
+
+def studio_jobs(scene: Path) -> list[Job]:
+    """Edit a scene in the studio, and hand it on in each format."""
+
+    def prepare(output: Path) -> None:
+        copy_prepared("older studio", make, output)
+
+    def make(output: Path) -> None:
+        studio = StudioScene(output)
+        output.mkdir()
+        studio.write_new_job("Box", [])
+        studio.made.mkdir()
+        shutil.copy2(scene, studio.made / "box.ply")
+        facts = {"file": "box.ply", "aligned": False, "reports": {}, "verdict": None}
+        studio.write_state({"outcome": "done", "result": facts})
+        run_command([STUDIO, "show", output])
+        gone = np.packbits(np.arange(_shown(output)) < _GONE, bitorder="little").tobytes()
+        studio.write_page_edit(PageEdit(_shown(output), base64.b64encode(gone).decode(), title="B"))
+
+    def edit(output: Path, again: bool) -> list[object]:
+        return [STUDIO, *(["show", output] if again else ["edit", output, '{"version": ""}'])]
+
+    def check_edit(output: Path, whole: Path) -> None:
+        new, file = _shown(whole), StudioScene(output).scene_file()
+        if {_shown(output), len(read_gaussians(file))} - {new, new + _GONE}:
+            raise Defect("neither the old scene nor the new one")
+
+    def check_edited(output: Path, whole: Path) -> None:
+        studio = StudioScene(output)
+        if _shown(output) != len(read_gaussians(studio.scene_file())) or not studio.is_shown():
+            raise Defect("the site shows another scene than the file")
+        is_edited = _shown(output) == _shown(whole)
+        if (studio.job.title == "B") != is_edited:
+            raise Defect("the title is that of another scene")
+
+    def export(kind: str) -> Job:
+        def command(output: Path, _: bool) -> list[object]:
+            return [STUDIO, "export", output, json.dumps({"kind": kind})]
+
+        def check_killed(output: Path, whole: Path) -> None:
+            made = StudioScene(output).exports / f"Box.{kind}"
+            expected = StudioScene(whole).exports / made.name
+            if kind != "zip" and made.exists() and digest(made) != digest(expected):
+                raise Defect("a part of a file")
+
+        def check_done(output: Path, whole: Path) -> None:
+            if names_in(output) != names_in(whole):
+                raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")
+            check_killed(output, whole)
+
+        name = f"studio export {kind}"
+        return Job(name, "studio", "box", command, check_done, prepare, check_killed)
+
+    exports = [export(kind) for kind in ("ply", "spz", "sog", "glb", "html", "zip")]
+    return [Job("studio edit", "studio", "box", edit, check_edited, prepare, check_edit), *exports]
+
+
+_GONE = 5  # Gaussians that an edit removes
+
+
+def _shown(studio: Path) -> int:
+    """The number of Gaussians of the site of a scene of the studio."""
+    return len(read_gaussians(SiteFolder(studio / "site").scene()))
+
+
+def studio_make_jobs(photos: Path) -> list[Job]:
+    """The job of the studio: from photos to a site."""
+
+    def prepare(output: Path) -> None:
+        output.mkdir()
+        StudioScene(output).write_new_job("Photos", [photos])
+        StudioScene(output).change(quality="draft")
+
+    def command(output: Path, _: bool) -> list[object]:
+        return [STUDIO, "make", output]
+
+    def check_done(output: Path, _: Path) -> None:
+        studio = StudioScene(output)
+        if studio.state().get("outcome") != "done":
+            raise Defect(f"the state is {studio.state()}")
+        if _shown(output) != len(read_gaussians(studio.scene_file())):
+            raise Defect("the site shows another scene than the file")
+
+    return [Job("studio-make", "studio-make", "photos", command, check_done, prepare)]
+
+
+def copy_prepared(name: str, make: Callable[[Path], None], output: Path) -> None:
+    """Copy a folder that ``make`` makes once, beside those of all rounds."""
+    prepared = output.parents[1] / name
+    if not prepared.exists():
+        make(prepared)
+    shutil.copytree(prepared, output)
+
+
+def run_command(command: list[object]) -> None:
+    """Run a command that is not killed, in a process of its own."""
+    module = "snowsplat.studio" if command[0] == STUDIO else "snowsplat"
+    words = [str(word) for word in command if word != STUDIO]
+    subprocess.run(
+        [sys.executable, "-m", module, *words],
+        env={**os.environ, "PYTHONPATH": _SOURCE},
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+
+
 _STEPS = 60
 _PLAIN = (
     *("--iterations", _STEPS, "--eval", "--checkpoint-every", 10, "--device", "cpu"),
@@ -500,9 +683,13 @@ def train_jobs(dataset: Path) -> list[Job]:
     def replacing(output: Path, _: bool) -> list[object]:
         return ["train", dataset, "-o", output, *_PLAIN, "--overwrite"]
 
+    def older_training(out: Path) -> None:
+        arguments = ["train", dataset, "-o", out, "--iterations", 25, "--checkpoint-every", 5]
+        run_command([*arguments, "--device", "cpu", "--quiet"])
+
     def older(output: Path) -> None:
         """The output of a training run with other settings."""
-        shutil.copytree(_older_training(output.parents[1], dataset), output)
+        copy_prepared("older", older_training, output)
 
     return [
         Job("train", "train", "out", plain(), check_same),
@@ -510,19 +697,6 @@ def train_jobs(dataset: Path) -> list[Job]:
         Job("train --minutes", "train", "out", timed, check_complete),
         Job("train --overwrite", "train", "out", replacing, check_same, older),
     ]
-
-
-def _older_training(folder: Path, dataset: Path) -> Path:
-    out = folder / "older"
-    if not out.exists():
-        arguments = ["train", dataset, "-o", out, "--iterations", 25, "--checkpoint-every", 5]
-        subprocess.run(
-            [sys.executable, "-m", "snowsplat", *map(str, arguments), "--device", "cpu", "--quiet"],
-            env={**os.environ, "PYTHONPATH": _SOURCE},
-            check=True,
-            stdout=subprocess.DEVNULL,
-        )
-    return out
 
 
 def sfm_jobs(photos: Path) -> list[Job]:

@@ -1,6 +1,7 @@
 """A `snowsplat` command that can kill itself: ``watched_command.py RUN``, started by `harness`.
 
-RUN is JSON: {"argv", "folder", "changes", "at", "delay", "limits"}. The command begins in "folder".
+RUN is JSON: {"argv", "folder", "changes", "at", "delay", "limits"}. "argv" begins with `STUDIO` for
+a worker of the studio. The command begins in "folder".
 With "at" it kills its process group with SIGKILL before the at-th time that its Python code changes
 a file in "folder", or "delay" seconds after that. If it ends by itself, it writes the number of
 changes to the file "changes".
@@ -18,6 +19,8 @@ from dataclasses import replace
 
 import pycolmap  # noqa: F401  (so that kills do not hit the import)
 
+#: The first word of the command of a worker of the studio.
+STUDIO = "--studio"
 _CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate")
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
@@ -55,8 +58,9 @@ def _run(run: dict) -> int:
     os.chdir(run["folder"])
     tempfile.tempdir = None  # so that TMPDIR is read
     sys.argv = ["snowsplat", *run["argv"]]
-    from snowsplat.cli.main import main
+    from snowsplat.cli.main import main as command_line
     from snowsplat.pipeline import make
+    from snowsplat.studio.__main__ import main as studio
 
     # `make` with a very short training that always writes checkpoints.
     make._CHECKPOINT_SECONDS = 0.05
@@ -70,7 +74,8 @@ def _run(run: dict) -> int:
     changes = [0]
     _kill_at(run["at"], run["delay"], run["folder"], changes)
     try:
-        code = main(run["argv"])
+        is_studio = run["argv"][0] == STUDIO
+        code = studio(run["argv"][1:]) if is_studio else command_line(run["argv"])
     except SystemExit as ended:
         code = int(ended.code or 0)
     except BaseException:

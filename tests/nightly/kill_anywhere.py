@@ -1,6 +1,9 @@
-"""Kills `sfm`, `train`, `make` and `convert` at random times, and checks that nothing is lost.
+"""Kills commands that write files at random times, and checks that nothing is lost or mixed.
 
     PYTHONPATH=src python tests/nightly/kill_anywhere.py --kills 200
+    PYTHONPATH=src python tests/nightly/kill_anywhere.py --subcommands publish convert studio
+
+"studio" is its worker: edits and exports; "studio-make" its job, from photos to a site.
 
 Each round starts with a new folder and kills the command (SIGKILL, with its children) one to five
 times in a row. After each kill it opens all files that have their final names. Then the same
@@ -28,33 +31,40 @@ from kill.harness import (
     Runner,
     convert_jobs,
     make_jobs,
+    publish_jobs,
     sfm_jobs,
     some_gaussians,
+    studio_jobs,
+    studio_make_jobs,
     train_jobs,
 )
 from snowsplat.formats import write_gaussians
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
-SUBCOMMANDS = ("sfm", "train", "make", "convert")
+SUBCOMMANDS = ("sfm", "train", "make", "convert", "publish", "studio", "studio-make")
 # Shares of all kills; slow subcommands have fewer.
-_SHARES = {"sfm": 0.2, "train": 0.35, "make": 0.15, "convert": 0.3}
+_SHARES = {"sfm": 0.15, "train": 0.25, "make": 0.1, "convert": 0.15, "publish": 0.15}
+_SHARES |= {"studio": 0.15, "studio-make": 0.05}
 
 
 def jobs(folder: Path, subcommands: list[str]) -> list[Job]:
     """The jobs of all subcommands, with small inputs in ``folder``."""
     found: list[Job] = []
-    if "convert" in subcommands:
-        write_gaussians(folder / "in.ply", some_gaussians(4000, 1))
-        write_gaussians(folder / "other.ply", some_gaussians(100, 2))
-        found += convert_jobs(folder / "in.ply", folder / "other.ply")
+    scenes = folder / "in.ply", folder / "other.ply"
+    write_gaussians(scenes[0], some_gaussians(4000, 1))
+    write_gaussians(scenes[1], some_gaussians(100, 2))
+    found += convert_jobs(*scenes) if "convert" in subcommands else []
+    found += publish_jobs(*scenes) if "publish" in subcommands else []
+    found += studio_jobs(scenes[0]) if "studio" in subcommands else []
     if "train" in subcommands:
         write_toy_dataset(folder / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
         found += train_jobs(folder / "dataset")
-    if "sfm" in subcommands or "make" in subcommands:
+    if {"sfm", "make", "studio-make"} & {*subcommands}:
         write_synthetic_photos(folder / "photos", n_views=16, width=320, height=240)
         found += sfm_jobs(folder / "photos") if "sfm" in subcommands else []
         found += make_jobs(folder / "photos") if "make" in subcommands else []
+        found += studio_make_jobs(folder / "photos") if "studio-make" in subcommands else []
     return found
 
 

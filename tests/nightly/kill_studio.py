@@ -40,11 +40,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from browser import Browser, BrowserError, chromium
+from kill.harness import names_in
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.film import moved_film, page_frames
 from snowsplat.project.edit_record import read_record
 from snowsplat.project.page_film import PageFilm
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio.library import Library
 from snowsplat.synthetic import write_synthetic_photos
@@ -333,7 +335,9 @@ class Kills:
         check(about["status"] == "done", f"the scene is {about['status']}")
         file, scene = self.scene.scene_file(), self.scene
         count = len(read_gaussians(file))
-        check(len(read_sog(scene.site / "scene.sog").means) == count, "the site is another one")
+        check(
+            len(read_sog(SiteFolder(scene.site).scene()).means) == count, "the site is another one"
+        )
         check(about["state"]["result"]["gaussians"] == count, "the figures are others")
         record = read_record(file)
         original = read_gaussians(scene.made / about["state"]["result"]["file"])
@@ -346,7 +350,7 @@ class Kills:
             before = self.scene.scene_file()
             record = read_record(before)
             removed, scale = (record.removed, record.scale) if record else (0, 1.0)
-            count = len(read_sog(self.scene.site / "scene.sog").means)
+            count = len(read_sog(SiteFolder(self.scene.site).scene()).means)
             gone = np.packbits(np.arange(count) < 5, bitorder="little").tobytes()
             changes = {"count": count, "removed": base64.b64encode(gone).decode(), "scale": 1.25}
             changes["title"] = title = f"Fox {number}"
@@ -417,8 +421,8 @@ class Kills:
             else:
                 with zipfile.ZipFile(file) as archive:
                     check(archive.testzip() is None, "the zip file is damaged")
-                    site = sorted(path.name for path in self.scene.site.iterdir())
-                    names = sorted(name for name in archive.namelist() if not name.endswith("/"))
+                    site = names_in(self.scene.site)
+                    names = {name for name in archive.namelist() if not name.endswith("/")}
                     check(names == site, "the zip file has other files than the site")
             self.check_shown()
 

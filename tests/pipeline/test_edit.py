@@ -20,6 +20,7 @@ from snowsplat.pipeline.view import viewed_scene
 from snowsplat.project import edit_record
 from snowsplat.project.edit_record import Note, PageEdit, read_record, shown_file
 from snowsplat.project.page_film import PageFilm
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
@@ -66,11 +67,11 @@ def write_scene(folder: Path, with_cameras: bool) -> Path:
 def test_what_is_removed_in_the_page_is_removed_in_the_scene(scene, tmp_path):
     before = scene.read_bytes()
     gone = np.random.default_rng(1).random(N) < 0.4
-    shown = read_sog(tmp_path / "site" / "scene.sog")
+    shown = read_sog(SiteFolder(tmp_path / "site").scene())
     target = edit(scene, tmp_path / "site", PageEdit(N, bits(gone)))
     assert (target.name, scene.read_bytes()) == ("tour_edited.ply", before)
     publish(target, tmp_path / "after")
-    after = read_sog(tmp_path / "after" / "scene.sog")
+    after = read_sog(SiteFolder(tmp_path / "after").scene())
     # The opacities, in the order of a line through the page, tell which ones are left.
     assert len(after.means) == N - gone.sum()
     expected = np.sort(shown.opacity_logits[~gone])
@@ -85,7 +86,7 @@ def test_what_is_removed_in_the_page_is_removed_in_the_scene(scene, tmp_path):
 
 def test_what_the_sliders_hide_is_removed(scene, tmp_path):
     """As the page does it: by the centres and sizes that it shows."""
-    shown = read_sog(tmp_path / "site" / "scene.sog")
+    shown = read_sog(SiteFolder(tmp_path / "site").scene())
     # The world of the viewer is rotated about the z axis.
     x, y, z = np.median(shown.means, axis=0)
     distances = np.linalg.norm(shown.means - [x, y, z], axis=1)
@@ -208,7 +209,7 @@ def test_a_person_turns_the_scene(scene, tmp_path):
 
 def read_sog_places(folder: Path) -> np.ndarray:
     """(N, 3) the centres in the viewer."""
-    return read_sog(folder / "site" / "scene.sog").means * [-1.0, -1.0, 1.0]
+    return read_sog(SiteFolder(folder / "site").scene()).means * [-1.0, -1.0, 1.0]
 
 
 def match(places: np.ndarray, expected: np.ndarray) -> float:

@@ -14,6 +14,7 @@ import pytest
 
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
+from snowsplat.pipeline.run import watchers
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.watchers import FOLDER, socket_in
 from snowsplat.pipeline.train import train
@@ -149,6 +150,23 @@ def test_the_socket_of_a_killed_training_is_harmless(dataset, tmp_path):
         watch(out, page, observer=FolderOnly())
     train(dataset, out, OPTIONS, overwrite=True)
     assert not (out / FOLDER).exists()
+
+
+@pytest.mark.parametrize("files", [None, "/nowhere"], ids=["Linux", "without /proc"])
+@pytest.mark.parametrize("name", ["out", "a very long name " * 9, "图像" * 30])
+def test_the_name_of_the_folder_may_be_long(tmp_path, monkeypatch, files, name):
+    """A path of a socket has at most 107 bytes here, and 103 on macOS."""
+    if files is not None:
+        monkeypatch.setattr(watchers, "_OPEN_FILES", files)
+    out = tmp_path / name
+    out.mkdir()
+    with socket.socket(socket.AF_UNIX) as listener, socket.socket(socket.AF_UNIX) as watcher:
+        with socket_in(out, create=True) as path:
+            listener.bind(path)
+            listener.listen()
+        assert (out / FOLDER / "socket").is_socket()
+        with socket_in(out) as path:
+            watcher.connect(path)
 
 
 def test_a_folder_of_others_is_not_used(tmp_path):

@@ -8,6 +8,7 @@ import torch
 
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.util.files import write_json
 
 from ..browser import Browser, Page
@@ -35,7 +36,7 @@ def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     assert studio.ask(f"{address}/edit", "DELETE") == (200, {"file": "box.ply"})
     about = studio.ask(address)[1]
     assert (about["edited"], about["state"]["result"]["gaussians"]) == (0, N)
-    assert len(read_sog(finished.site / "scene.sog").means) == N
+    assert len(read_sog(SiteFolder(finished.site).scene()).means) == N
     assert not finished.exports.exists()  # they were those of the edited scene
     assert studio.ask(f"{address}/edit", "DELETE")[0] == 400
 
@@ -119,7 +120,7 @@ def test_a_site_has_no_tools_but_its_page_in_the_studio_has(studio, finished):
     assert 'src="../../../tools.js" data-page="small" data-edited="false"' in page
     assert "tools.js" not in (finished.site / "index.html").read_text("utf-8")
     # Levels of detail are edited in another page.
-    (finished.site / "scene.sog").unlink()
+    SiteFolder(finished.site).scene().unlink()
     page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
     assert 'data-page="levels"' in page
 

@@ -9,6 +9,7 @@ import pytest
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline import publish
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.studio import job
 
 from .conftest import N, edit_of
@@ -61,7 +62,7 @@ def test_levels_of_detail_are_edited_in_a_page_of_their_own(studio, finished, mo
     assert studio.ask(f"{address}/whole/index.html")[0] == 404
     assert studio.ask(f"{address}/whole", "POST", {}) == (200, {})
     assert b'data-page="whole"' in studio.ask(f"{address}/whole/index.html")[1]
-    shown = read_sog(finished.whole / "scene.sog")
+    shown = read_sog(SiteFolder(finished.whole).scene())
     assert shown.sh_rest.shape[1] == 0
     written = (finished.whole / "index.html").stat().st_mtime_ns
     assert studio.ask(f"{address}/whole", "POST", {}) == (200, {})

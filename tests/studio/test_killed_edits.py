@@ -11,6 +11,7 @@ import pytest
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.project.page_film import PageFilm
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.studio import changes, job
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
@@ -61,7 +62,7 @@ def test_what_is_left_of_an_edit_is_done(studio, finished, monkeypatch, before):
     for _ in range(2):
         about = studio.ask(address)[1]
         assert (about["status"], about["title"]) == ("done", "Half" if is_edited else "Box")
-        assert len(read_sog(finished.site / "scene.sog").means) == N - 20 * is_edited
+        assert len(read_sog(SiteFolder(finished.site).scene()).means) == N - 20 * is_edited
         keys = from_json(PageFilm, read_json(finished.plan)).keys
         assert np.allclose(keys[1][:3], [2, 0, -18] if is_edited else [1, 0, -9])
         changes.show_scene(finished)

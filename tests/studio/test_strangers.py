@@ -7,6 +7,7 @@ import re
 import pytest
 from tests.studio.conftest import of_the_command_line
 
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio import job
 from snowsplat.viewer.web.viewer_page import asset
@@ -111,7 +112,8 @@ def test_a_token_that_only_reads_one_thing(studio, strange, finished):
     site = url.split("/")[3]
     status, _, page = raw(studio, f"/{site}/scenes/Box/site/index.html")
     assert (status, "tools.js" in page) == (200, False)
-    assert raw(studio, f"/{site}/scenes/Box/site/scene.sog", "HEAD")[0] == 200
+    content = SiteFolder(finished.site).scene().relative_to(finished.site)
+    assert raw(studio, f"/{site}/scenes/Box/site/{content.as_posix()}", "HEAD")[0] == 200
     assert studio.server.token not in url + told["made"]
     full = studio.server.token
     upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}

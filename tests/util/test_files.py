@@ -13,8 +13,11 @@ from pathlib import Path
 import pytest
 
 import snowsplat
+from snowsplat.util import files
+from snowsplat.util.errors import UserError
 from snowsplat.util.files import (
     atomic_path,
+    new_entries,
     new_folder,
     remove_temporaries,
     write_json,
@@ -137,14 +140,109 @@ def test_errors_name_the_target_and_not_the_temporary_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_new_folder_is_empty_and_removed_unless_it_was_renamed(tmp_path):
-    (tmp_path / "new").mkdir()
-    (tmp_path / "new" / "of a killed process").touch()
+def test_a_new_folder_is_empty_and_removed(tmp_path):
+    path = tmp_path / "new"
+    path.mkdir()
+    (path / "left by a killed process").touch()
+    with new_folder(path) as folder:
+        assert folder == path
+        assert not list(folder.iterdir())
+        with new_folder(path) as other:  # as in another process
+            (other / "a").touch()
+        assert not list(folder.iterdir())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_link_in_the_place_of_a_new_folder_is_not_followed(tmp_path):
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs/file").touch()
+    (tmp_path / "new").symlink_to(tmp_path / "theirs")
     with new_folder(tmp_path / "new") as folder:
-        assert list(folder.iterdir()) == []
-        (folder / "file").touch()
-    assert list(tmp_path.iterdir()) == []
-    with new_folder(tmp_path / "new") as folder:
-        (folder / "file").touch()
-        folder.rename(tmp_path / "kept")
-    assert [path.name for path in tmp_path.rglob("*")] == ["kept", "file"]
+        assert folder != tmp_path / "new"
+    assert (tmp_path / "theirs/file").exists()
+
+
+@pytest.fixture
+def entries(tmp_path):
+    """A folder with ``a/old``, ``b/old``, the file ``c`` and a file of somebody else."""
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "old").touch()
+    (tmp_path / "c").write_text("old")
+    (tmp_path / "foreign").touch()
+    return tmp_path
+
+
+def write_new(new):
+    (new / "a").mkdir()
+    (new / "a/new").touch()
+    (new / "c").write_text("new")
+
+
+def contents(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("exchanges", [True, False])
+def test_entries_are_replaced_at_the_end(entries, monkeypatch, exchanges):
+    if not exchanges:  # as on Windows
+        monkeypatch.setattr(files, "_exchanged", lambda one, other: False)
+    with new_entries(entries, ["a", "b", "c"]) as new:
+        write_new(new)
+        assert contents(entries) == {"a/old", "b/old", "c", "foreign", *staged(new, entries)}
+    assert contents(entries) == {"a/new", "c", "foreign"}
+    assert (entries / "c").read_text() == "new"
+    assert {path.name for path in entries.iterdir()} == {"a", "c", "foreign"}
+
+
+def staged(new, folder):
+    return {str(path.relative_to(folder)) for path in new.rglob("*") if path.is_file()}
+
+
+def replace(folder, names, write):
+    with new_entries(folder, names) as new:
+        write(new)
+
+
+def test_a_failure_replaces_no_entry(entries):
+    def fail(new):
+        write_new(new)
+        raise OSError(errno.ENOSPC, "the disk is full")
+
+    with pytest.raises(OSError, match="full"):
+        replace(entries, ["a", "b", "c"], fail)
+    assert contents(entries) == {"a/old", "b/old", "c", "foreign"}
+
+
+def test_files_links_and_folders_replace_each_other(entries):
+    (entries / "link").symlink_to(entries / "b")
+    with new_entries(entries, ["c", "a", "link"]) as new:
+        (new / "c").mkdir()
+        (new / "c/new").touch()
+        (new / "a").write_text("a file")
+        (new / "link").mkdir()
+    assert contents(entries) == {"c/new", "a", "b/old", "foreign"}
+    assert not (entries / "link").is_symlink()
+
+
+def test_entries_that_must_not_be_written_stay(entries, monkeypatch):
+    """Somebody else has taken the lock while the new ones were written."""
+    lost = []
+
+    def check(path):
+        if lost:
+            raise UserError("lost")
+
+    monkeypatch.setattr(files, "CHECKS", [check])
+    with pytest.raises(UserError, match="lost"):
+        replace(entries, ["a", "c"], lambda new: (write_new(new), lost.append(True)))
+    assert contents(entries) == {"a/old", "b/old", "c", "foreign"}
+
+
+def test_the_last_entry_is_absent_while_the_others_are_replaced(entries, monkeypatch):
+    """It shows that they belong together, so a kill in between leaves nothing mixed."""
+    seen = []
+    monkeypatch.setattr(files, "_exchanged", lambda *_: seen.append((entries / "c").exists()))
+    with new_entries(entries, ["a", "b", "c"]) as new:
+        write_new(new)
+    assert seen == [False]

@@ -11,9 +11,11 @@ from collections.abc import Callable
 import pytest
 
 from snowsplat.util.interrupts import (
+    ask_to_end,
     ended_by_signals,
     ended_together,
     interrupts_between_steps,
+    of_own_group,
     raise_deferred_interrupt,
 )
 
@@ -112,6 +114,36 @@ def test_a_signal_that_is_ignored_stays_ignored():
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_ctrl_break_is_what_ends_a_process_of_windows(monkeypatch):
+    """No Windows was seen: its names are those of the documentation of Python."""
+    monkeypatch.setattr(signal, "SIGBREAK", signal.SIGUSR1, raising=False)
+    with pytest.raises(KeyboardInterrupt), ended_by_signals():
+        os.kill(os.getpid(), signal.SIGUSR1)
+    sent = []
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(signal, "CTRL_BREAK_EVENT", 1, raising=False)
+    monkeypatch.setattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 512, raising=False)
+    monkeypatch.setattr(os, "kill", lambda *how: sent.append(how))
+    ask_to_end(77)
+    assert sent == [(77, 1)]
+    assert of_own_group() == {"creationflags": 512}
+
+
+def test_a_process_of_its_own_group_is_asked_to_end():
+    code = "import time; from snowsplat.util.interrupts import ended_by_signals\n"
+    code += "with ended_by_signals():\n try: print('begun', flush=True); time.sleep(60)\n"
+    code += " except KeyboardInterrupt: print('saved')"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, **of_own_group()
+    )
+    with process:
+        assert process.stdout.readline() == "begun\n"
+        assert os.getpgid(process.pid) == process.pid
+        ask_to_end(process.pid)
+        assert process.stdout.read() == "saved\n"
+    ask_to_end(process.pid)  # it has ended
 
 
 def test_a_child_gets_the_signal():

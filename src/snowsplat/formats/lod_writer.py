@@ -30,7 +30,7 @@ from snowsplat.formats.gaussian_arrays import GaussianArrays
 from snowsplat.formats.lod import INDEX, read_index
 from snowsplat.formats.sog import encode_sog
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import new_folder, write_bytes, write_text
+from snowsplat.util.files import new_entries, write_bytes, write_text
 
 _FACTOR = 4  # between the numbers of Gaussians of two levels
 _FARTHER = 2.3  # see `simplify`: each level is shown from about three times the distance
@@ -88,10 +88,10 @@ def write_lod(
     path.parent.mkdir(parents=True, exist_ok=True)
     before = _level_folders(path)
     folder = _free_name(path.parent)
-    with new_folder(path.parent / f".{_FOLDER}.tmp") as temporary:
-        writer = _Writer(temporary, sizes.file, levels, report)
+    with new_entries(path.parent, [folder.name]) as new:
+        (new / folder.name).mkdir()
+        writer = _Writer(new / folder.name, sizes.file, levels, report)
         writer.write(packable, leaves)
-        temporary.rename(folder)
     counts = [sum(leaf.runs[level]["count"] for leaf in leaves) for level in range(levels)]
     index = {
         "version": 1,
@@ -105,14 +105,6 @@ def write_lod(
     write_text(path, json.dumps(index))
     for old in before:
         shutil.rmtree(old, ignore_errors=True)
-
-
-def remove_lod(path: Path) -> None:
-    """Remove what `write_lod` has written for this ``path``, if it exists."""
-    folders = _level_folders(path)
-    path.unlink(missing_ok=True)
-    for folder in folders:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _level_folders(path: Path) -> set[Path]:

@@ -22,12 +22,12 @@ from snowsplat.project.edit_record import (
     written_with_record,
 )
 from snowsplat.project.project import Project
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.scene.edit import transform, with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, quat_from_rotation, quat_product
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.panel import numbers_of, rotation_of_page, view_of_page
-from snowsplat.viewer.web.publication import SCENE
 
 # SOG stores positions in steps. They differ from those of the scene by at most half of one, and
 # float32 numbers by this share.
@@ -146,7 +146,10 @@ def _rows_of_page(scene: Path, gaussians: Gaussians, usable: Tensor, site: Path)
     arrays = GaussianArrays.from_gaussians(gaussians.select(usable))
     order = order_in_sog(scene, arrays)
     rows = usable.nonzero()[:, 0].numpy()[order]
-    shown, expected = (_logs(a) for a in (read_sog(site / SCENE).means, arrays.means[order]))
+    content = SiteFolder(site).scene()
+    if content is None:
+        raise OtherScene("{site}: the page did not show {name}", site=site, name=scene.name)
+    shown, expected = (_logs(a) for a in (read_sog(content).means, arrays.means[order]))
     if shown.shape == expected.shape and len(rows):
         step = np.ptp(expected, axis=0) / 65535
         if (np.abs(shown - expected) <= 0.51 * step + _ROUNDING * np.abs(expected)).all():

@@ -13,13 +13,14 @@ from snowsplat.pipeline.options.publish import PublishOptions
 from snowsplat.pipeline.output.scene_files import write_levels
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.project.project import Project
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import check_output
 from snowsplat.util.messages import message
 from snowsplat.viewer.web.panel import Description, made_on
-from snowsplat.viewer.web.publication import SCENE, is_site, write_one_file, write_site
+from snowsplat.viewer.web.publication import write_one_file, write_site
 
 #: Larger scenes are written in levels of detail. Phones show at most that many Gaussians at a time.
 _LARGE = 2_000_000
@@ -64,8 +65,9 @@ def publish(
         OSError: a file cannot be written.
     """
     options, folder = options or PublishOptions(), Path(folder)
-    check_output(folder, lambda _: is_site(folder))
-    if not overwrite and is_site(folder):
+    site = SiteFolder(folder)
+    check_output(folder, lambda entry: bool(site.content()) or site.is_leftover(entry))
+    if not overwrite and site.content():
         raise UserError(
             "{folder}: already contains a web site; use `overwrite` to replace it", folder=folder
         )
@@ -99,7 +101,6 @@ def publish(
 
 
 def _write_levels(observer: Observer, folder: Path, gaussians: Gaussians) -> str:
-    """Write the levels of detail of a site, and remove the SOG file of an earlier one."""
+    """Write the levels of detail of a site."""
     write_levels(folder / INDEX, gaussians, observer)
-    (folder / SCENE).unlink(missing_ok=True)
     return INDEX

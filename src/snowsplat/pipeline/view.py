@@ -14,12 +14,13 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_files import write_levels
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.project.project import Project
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.viewer.http.static import Served
 from snowsplat.viewer.web.panel import Description, made_on
-from snowsplat.viewer.web.publication import PAGE, is_site, site_files
+from snowsplat.viewer.web.publication import site_files
 from snowsplat.viewer.web.scene import ready, site
 
 #: Larger scenes are shown in levels of detail. The viewer never draws more Gaussians at a time.
@@ -48,10 +49,10 @@ def viewed_scene(
     Raises: UserError: the scene is missing or damaged, or has no Gaussians.
     """
     path = Path(path)
-    if is_site(path):
+    if SiteFolder(path).content() is not None:
         if iteration is not None:
             raise UserError("`iteration` selects a scene of an output folder; leave it out")
-        yield ViewedScene(path / PAGE, None, *site_files(path))
+        yield ViewedScene(SiteFolder(path).page, None, *site_files(path))
         return
     project = Project.open(path, iteration)
     title, index = project.name, project.scene

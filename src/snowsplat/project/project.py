@@ -22,6 +22,7 @@ from snowsplat.formats.sog import META, is_sog
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.project.edit_record import EditRecord, read_record
 from snowsplat.project.left_out import LeftOut
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.training_folder import DATASET, SCENE, TrainingFolder
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
@@ -193,8 +194,10 @@ def _read_make_record(folder: Path) -> dict[str, Any]:
 
 def _index_in(folder: Path) -> Path | None:
     """The file that describes the scene of which ``folder`` consists: `lod-meta.json`, the
-    `meta.json` of SOG, the newest scene of a training of gsplat, or its only scene file, as in a
-    published site; None if there is none."""
+    `meta.json` of SOG, what a published site shows, the newest scene of a training of gsplat, or
+    its only scene file; None if there is none."""
+    if content := SiteFolder(folder).content():
+        return content
     if (folder / INDEX).is_file():
         return folder / INDEX
     sog = folder / META

@@ -39,7 +39,7 @@ from snowsplat.sfm.report.scene_map import PlacedPhoto
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import new_folder, remove_temporaries
+from snowsplat.util.files import STAGE, new_entries, remove_temporaries
 from snowsplat.util.messages import Message, message
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json, inside
@@ -201,22 +201,11 @@ def _gather(
 ) -> dict[str, Any]:
     """Gather the photos into a temporary folder, then replace `input/` and the masks by them. If
     the photos are in `input/` already (``in_place``), only the masks are written."""
-    old = DatasetFolder(folder)
     if in_place:
-        shutil.rmtree(old.distorted_masks, ignore_errors=True)
+        shutil.rmtree(DatasetFolder(folder).distorted_masks, ignore_errors=True)
         return asdict(gather(sources, folder, options, report))
-    with new_folder(folder / ".new") as new:
-        gathered = gather(sources, new, options, report)
-        made = DatasetFolder(new)
-        for source, target in (
-            (made.photos, old.photos),
-            (made.distorted_masks, old.distorted_masks),
-        ):
-            shutil.rmtree(target, ignore_errors=True)
-            if source.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                source.rename(target)
-    return asdict(gathered)
+    with new_entries(folder, [DatasetFolder.distorted_masks.name, _PHOTOS]) as new:
+        return asdict(gather(sources, new, options, report))
 
 
 def _undistort(
@@ -224,8 +213,6 @@ def _undistort(
 ) -> dict[str, Any]:
     import pycolmap
 
-    for name in IMAGE_FOLDERS:
-        shutil.rmtree(folder / name, ignore_errors=True)
     model = pycolmap.Reconstruction(DatasetFolder(folder).distorted_model)
     marker: tuple[MarkerScale | None, list[Message]] = (None, [])
     if options.marker is not None:
@@ -268,7 +255,7 @@ def _check_free(
                 what=what,
             )
         return
-    allowed = {LOCK, ".new"}  # .new: left by a run that was killed in its first stage
+    allowed = {LOCK, STAGE}  # the latter: left by a run that was killed in its first stage
     if in_place:
         kept = DatasetFolder(folder)
         allowed |= {kept.photos.name}

@@ -6,7 +6,6 @@ lens, and a panorama, becomes several images.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -15,7 +14,6 @@ import numpy as np
 
 from snowsplat.data.lens.views import LensView
 from snowsplat.scene.geometry import Similarity
-from snowsplat.util.files import new_folder
 
 if TYPE_CHECKING:
     import pycolmap
@@ -27,7 +25,7 @@ def write_model(
     scene_from_sfm: Similarity,
     sparse: Path,
 ) -> None:
-    """Transform ``model`` in place and write it to ``sparse``/0; replaces an existing folder.
+    """Transform ``model`` in place and write it to ``sparse``/0, a new folder.
 
     Points keep their tracks and colours. Keypoints are moved to their undistorted positions.
     ``pinholes`` maps camera ids to the new cameras; the others are pinhole cameras already.
@@ -45,13 +43,10 @@ def write_model(
         camera.model = pycolmap.CameraModelId.PINHOLE
         camera.width, camera.height = pinhole.width, pinhole.height
         camera.params = list(pinhole.params)
-    # Write to a folder with a temporary name, so that ``sparse`` never contains a part of a model.
-    with new_folder(sparse.with_name(f".{sparse.name}.new")) as new:
-        (new / "0").mkdir()
-        model.write(new / "0")
-        model.export_PLY(new / "0" / "points3D.ply")
-        shutil.rmtree(sparse, ignore_errors=True)
-        new.rename(sparse)
+    folder = sparse / "0"
+    folder.mkdir(parents=True)
+    model.write(folder)
+    model.export_PLY(folder / "points3D.ply")
 
 
 def view_name(photo: str, view: LensView) -> str:

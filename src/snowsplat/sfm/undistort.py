@@ -14,7 +14,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,11 +32,11 @@ from snowsplat.data.photos.colour_profile import plain_pixels
 from snowsplat.data.photos.decode import resize_area
 from snowsplat.data.photos.image_file import open_image, reason_of
 from snowsplat.data.photos.image_loader import available_memory
-from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.project.dataset_folder import IMAGE_FOLDERS, DatasetFolder
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
 from snowsplat.sfm.progress import Report, in_threads
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import make_parent, new_entries
 
 if TYPE_CHECKING:
     import pycolmap
@@ -131,7 +131,8 @@ def undistort(
     see `in_views`. Files keep their names and formats: JPEG is saved at quality
     95 without chroma subsampling, all others without loss, with transparency. If a camera has no
     distortion, its photos are copied. A mask is written for each photo that has one, unless all
-    masked pixels are transparent in the image. The model is written last.
+    masked pixels are transparent in the image. What an earlier run has made there is replaced when
+    all is complete, the model last.
 
     Args:
         photos: the photos in ``input/``.
@@ -174,13 +175,15 @@ def undistort(
         max(1, available_memory() // (2 * _BYTES_PER_PIXEL * pixels)),
     )
     report(0, len(jobs), "photos")
-    # Pillow and torch release the GIL while they compute. Each job uses torch with one thread.
-    masks = in_threads(_undistort_photo, jobs, threads, report, partial(torch.set_num_threads, 1))
     wide = {number: some for number, some in views.items() if some[0].rotation is not None}
     pinholes = {number: some[0] for number, some in views.items() if number not in wide}
-    if wide:
-        model = in_views(model, wide)
-    write_model(model, pinholes, scene_from_sfm, dataset / "sparse")
+    with new_entries(dataset, IMAGE_FOLDERS) as new:
+        work = partial(_undistort_photo, DatasetFolder(new))
+        # Pillow and torch release the GIL while they compute. Each job uses torch with one thread.
+        masks = in_threads(work, jobs, threads, report, partial(torch.set_num_threads, 1))
+        if wide:
+            model = in_views(model, wide)
+        write_model(model, pinholes, scene_from_sfm, new / "sparse")
     return Undistorted(
         images=sum(sizes.values()),
         masks=sum(masks),
@@ -242,26 +245,26 @@ def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
 # One photo
 
 
-def _undistort_photo(job: _Job) -> int:
+def _undistort_photo(made: DatasetFolder, job: _Job) -> int:
     """Write the images, their smaller copies and their masks; returns the number of masks."""
     source, opaque = job.dataset.photos / job.name, None
     photo, form = job.decode(source)
     if photo.mode == "RGBA":
         opaque = np.asarray(photo)[..., 3] > 0
     if not job.resampled:
-        with _atomic_path_in_new_folder(job.dataset.images / job.name) as temporary:
-            shutil.copyfile(source, temporary)
+        make_parent(made.images / job.name)
+        shutil.copyfile(source, made.images / job.name)
     for name, view in job.views if job.resampled or job.divisors else ():
         image = undistort_image(photo, view)
         if job.resampled:
-            _save(image, job.dataset.images / name, form)
+            _save(image, made.images / name, form)
         for divisor in job.divisors:
-            folder = job.dataset.path / f"images_{divisor}"
+            folder = made.path / f"images_{divisor}"
             _save(_reduce(image, divisor), folder / name, form)
-    return _undistort_masks(job, opaque)
+    return _undistort_masks(made, job, opaque)
 
 
-def _undistort_masks(job: _Job, opaque: np.ndarray | None) -> int:
+def _undistort_masks(made: DatasetFolder, job: _Job, opaque: np.ndarray | None) -> int:
     """Write the masks of the images of a photo; returns their number.
 
     A mask of transparent pixels only, and one of no pixels of a view, is not written. ``opaque``:
@@ -273,12 +276,12 @@ def _undistort_masks(job: _Job, opaque: np.ndarray | None) -> int:
         mask = _mask_of((np.asarray(mask) >= 128) | ~opaque)
     written = 0
     for name, view in job.views:
-        made = None if mask is None else undistort_mask(mask, view)
+        kept = None if mask is None else undistort_mask(mask, view)
         if view.rotation is not None:  # the pixels that show nothing of the photo are masked
             used = covered_pixels(view, view.width, view.height)
-            made = _mask_of(used if made is None else used & (np.asarray(made) >= 128))
-        if made is not None:
-            _save(made, job.dataset.masks / f"{name}.png", "PNG")
+            kept = _mask_of(used if kept is None else used & (np.asarray(kept) >= 128))
+        if kept is not None:
+            _save(kept, made.masks / f"{name}.png", "PNG")
             written += 1
     return written
 
@@ -299,12 +302,7 @@ def _reduce(image: Image.Image, divisor: int) -> Image.Image:
     return Image.frombytes(mode, (width, height), small.tobytes()).convert(image.mode)
 
 
-def _atomic_path_in_new_folder(path: Path) -> AbstractContextManager[Path]:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return atomic_path(path)
-
-
 def _save(image: Image.Image, path: Path, form: str) -> None:
     """Save without metadata: the colours are those of sRGB."""
-    with _atomic_path_in_new_folder(path) as temporary:
-        image.save(temporary, form, icc_profile=None, **_SAVING[form])
+    make_parent(path)
+    image.save(path, form, icc_profile=None, **_SAVING[form])

@@ -18,10 +18,11 @@ from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames, write_keys
 from snowsplat.pipeline.options.publish import PublishOptions
-from snowsplat.pipeline.publish import publish
+from snowsplat.pipeline.publish import PublishResult, publish
 from snowsplat.project.edit_record import PageEdit, edited_file
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio.hand_on import export_file, is_exported
 from snowsplat.studio.job import is_being_made
@@ -30,8 +31,6 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.safe_json import from_json, is_file, read_json
 from snowsplat.util.settings import Settings
-from snowsplat.viewer.web.publication import PAGE
-from snowsplat.viewer.web.publication import SCENE as SITE_SCENE
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def _edit(scene: StudioScene, version: str, changes: PageEdit | None) -> dict[st
         undo_edits(file)
     else:
         try:
-            has_levels = not (scene.site / SITE_SCENE).is_file()
+            has_levels = SiteFolder(scene.site).scene() is None
             if has_levels:
                 show_whole(scene)  # it is gone if the scene was renamed meanwhile
             edit(file, scene.whole if has_levels else scene.site, changes)
@@ -176,8 +175,7 @@ def show_scene(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
     shown = [scene.version(), title]
     for folder in (scene.exports, scene.whole):  # they have another title, or other Gaussians
         shutil.rmtree(folder, ignore_errors=True)
-    scene.site.mkdir(parents=True, exist_ok=True)
-    site = publish(file, scene.site, PublishOptions(title), overwrite=True)
+    site = publish_site(scene, file, title)
     state = scene.state()
     if scene.found:
         state = {"outcome": "done", "result": _found(scene)}
@@ -185,6 +183,13 @@ def show_scene(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
     state["result"] |= figures
     scene.write_state(state)
     return {"file": file.name}
+
+
+def publish_site(scene: StudioScene, file: Path, title: str) -> PublishResult:
+    """Write the site. What else is in its folder is not of the studio, and is removed."""
+    if SiteFolder(scene.site).content() is None:
+        shutil.rmtree(scene.site, ignore_errors=True)
+    return publish(file, scene.site, PublishOptions(title), overwrite=True)
 
 
 def rename(scene: StudioScene, settings: Title) -> dict[str, Any]:
@@ -202,7 +207,7 @@ def show_whole(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
 
     Raises: UserError: the scene is not finished.
     """
-    file, page = finished(scene), scene.whole / PAGE
+    file, page = finished(scene), SiteFolder(scene.whole).page
     if not is_file(page) or page.stat().st_mtime_ns < file.stat().st_mtime_ns:
         options = PublishOptions(scene.job.title, for_editing=True)
         publish(file, scene.whole, options, overwrite=True)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import socket
 import subprocess
 import sys
@@ -15,6 +13,7 @@ from typing import Any
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import is_own
+from snowsplat.util.interrupts import ask_to_end, of_own_group
 from snowsplat.util.messages import as_message, message
 from snowsplat.util.run_lock import LOCK, holder, is_locked
 
@@ -39,7 +38,7 @@ def start(scene: StudioScene, task: str = "make") -> None:
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
-            start_new_session=True,
+            **of_own_group(),
         )
 
 
@@ -65,14 +64,14 @@ def stop(scene: StudioScene, task: str = "make") -> None:
     """
     process, lock = _own_process(scene, task), scene.lock(task)
     if process is not None:
-        process.terminate()
+        ask_to_end(process.pid)
         return
     if not is_locked(lock):
         return
     other = holder(lock)
     # Another user who can write to the folder could name any process of this one.
     if other.host == socket.gethostname() and other.process > 1 and is_own(lock):
-        os.kill(other.process, signal.SIGTERM)
+        ask_to_end(other.process)
     else:
         where = other.host or message("another computer")
         raise UserError("this scene is being made on {where}; stop it there", where=where)

@@ -13,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from snowsplat.project.project import Project
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio.library import UnknownScene
 from snowsplat.studio.requests import File, SceneRoutes, Studio
@@ -83,8 +84,8 @@ def shown_photos(scene: StudioScene) -> list[Path]:
 
 def picture_of(scene: StudioScene) -> Path | None:
     """Of the site; before that a rendered test view, or a photo."""
-    poster = scene.site / "poster.jpg"
-    if is_file(poster):
+    poster = SiteFolder(scene.site).poster()
+    if poster is not None and is_file(poster):
         return poster
     training = Project.open(scene.made).training
     views = training.rendered_views() if training else []

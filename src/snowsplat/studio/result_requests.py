@@ -15,6 +15,7 @@ from starlette.websockets import WebSocket
 
 from snowsplat.project.edit_record import PageEdit
 from snowsplat.project.page_film import PageFilm
+from snowsplat.project.site_folder import PAGE, SiteFolder
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio import job
 from snowsplat.studio.hand_on import FORMATS, export_file, film_command, is_exported
@@ -134,7 +135,7 @@ async def undo(studio: Studio, request: Request, scene: StudioScene) -> Any:
 
 
 async def site(studio: Studio, request: Request, scene: StudioScene) -> Any:
-    kind = "small" if (scene.site / "scene.sog").is_file() else "levels"
+    kind = "small" if SiteFolder(scene.site).scene() else "levels"
     return await with_tools(request, scene, scene.site, kind)
 
 
@@ -148,11 +149,11 @@ async def whole(studio: Studio, request: Request, scene: StudioScene) -> Any:
 
 
 async def with_tools(request: Request, scene: StudioScene, site: Path, kind: str) -> Any:
-    path = request.path_params["path"] or "index.html"
+    path = request.path_params["path"] or PAGE
     file = file_inside(site, path)
     if path in ("index.css", "index.js"):
         return File(asset_file(path))
-    if path != "index.html" or not is_file(file):
+    if path != PAGE or not is_file(file):
         return Data(file)
     try:
         page = page_anew(await asyncio.to_thread(file.read_text, "utf-8"))

@@ -23,8 +23,6 @@ from snowsplat.pipeline.film import film, film_preview
 from snowsplat.pipeline.make import make
 from snowsplat.pipeline.make_result import MakeResult
 from snowsplat.pipeline.options.make import MakeOptions
-from snowsplat.pipeline.options.publish import PublishOptions
-from snowsplat.pipeline.publish import publish
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.project.edit_record import shown_file
@@ -97,7 +95,7 @@ def _make(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
     recorder.begin("page")
     file = shown_file(made.scene)
     shown = [version_of(file), job.title]
-    site = publish(file, scene.site, PublishOptions(job.title), overwrite=True)
+    site = changes.publish_site(scene, file, job.title)
     recorder.leave()
     return _result(scene, made) | {"gaussians": site.gaussians, "shown": shown}
 

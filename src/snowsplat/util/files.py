@@ -1,13 +1,14 @@
 """Reading and atomic writing: a file appears under its name only when it is complete."""
 
 import contextlib
+import ctypes
 import json
 import os
 import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ GIT_LFS = b"version https://git-lfs.github.com/spec/"
 #: Called with the absolute path of a file before it is written and before it gets its name; they
 #: raise `UserError` if it must not be, such as `run_lock.LostLock`.
 CHECKS: list[Callable[[Path], None]] = []
+#: The folder in which `new_entries` makes what belongs into the folder around it.
+STAGE = ".snowsplat.new"
+_HERE = -100  # AT_FDCWD: paths are relative to the working folder
 _TEMPORARY = re.compile(r"\.(.+?)(\.[a-z0-9_]{8})?\.tmp")
 
 
@@ -97,20 +101,21 @@ def _temporary(path: Path, private: bool) -> tuple[int | None, Path]:
     return None, Path(name)
 
 
-def _lock(temporary: Path) -> int:
-    """Create or open a file, lock and empty it; return its handle.
+def _lock(temporary: Path, folder: bool = False) -> int:
+    """Create or open a file, lock and empty it, or lock a folder; return its handle.
 
     Raises: OSError: another writer holds the lock, locks are not supported, or the file cannot be
     created.
     """
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    handle = os.open(temporary, flags, 0o600)
+    flags = os.O_RDONLY | os.O_DIRECTORY if folder else os.O_RDWR | os.O_CREAT
+    handle = os.open(temporary, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # Between open and flock, the previous writer may have renamed the file.
+        # Between open and flock, the previous writer may have renamed it.
         if not os.path.samestat(os.fstat(handle), os.stat(temporary)):
             raise FileNotFoundError(temporary)
-        os.ftruncate(handle, 0)
+        if not folder:
+            os.ftruncate(handle, 0)
     except BaseException:
         os.close(handle)
         raise
@@ -133,13 +138,98 @@ def reading(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Context with an empty folder. It is removed at the end, if the block has not renamed it."""
-    shutil.rmtree(path, ignore_errors=True)  # of a process that was killed
-    path.mkdir(parents=True)
+    """Context with an empty folder, which is removed at the end.
+
+    Like the temporary file of `atomic_path`, it has the name ``path``, so that the next call
+    removes what a killed process has left there, or a random one if another process holds it.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    handle, folder = None, path
     try:
-        yield path
+        if path.is_symlink():
+            raise NotADirectoryError(path)
+        handle = _lock(path, folder=True) if fcntl is not None else None
+    except OSError:
+        folder = Path(tempfile.mkdtemp(prefix=f"{path.name}.", dir=path.parent))
+    try:
+        for left in folder.iterdir():
+            _remove(left)
+        yield folder
     finally:
+        _remove(folder)
+        if handle is not None:
+            os.close(handle)
+
+
+@contextlib.contextmanager
+def new_entries(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Context with an empty folder, whose entries replace those in ``folder`` at the end.
+
+    It is `STAGE` in ``folder``, so the disk must have the space for both. All is synced before
+    the first entry is replaced, and an entry is never a part of itself. If the block raises, or the
+    process is killed in it, nothing has changed.
+
+    Args:
+        names: files and folders, such as "images" or "distorted/masks". Those that the block has
+            not made are removed. The last one shows that the others belong together: if there are
+            several, it is removed first and comes last.
+
+    Raises:
+        OSError: ``folder`` cannot be written, or the disk is full.
+        UserError: one of `CHECKS` does not permit it.
+    """
+    for name in names:
+        _check(folder / name)
+    with new_folder(folder / STAGE) as new:
+        yield new
+        for path in new.rglob("*") if os.name == "posix" else ():
+            if not path.is_symlink():
+                _sync(path)
+        for name in names:
+            _check(folder / name)
+        *others, last = names
+        if others:
+            _set_aside(folder / last, new)
+        for name in names:
+            made, target = new / name, folder / name
+            if not os.path.lexists(made):
+                _set_aside(target, new)
+                continue
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.is_dir() and _exchanged(made, target):
+                continue
+            if target.is_dir() or made.is_dir():
+                _set_aside(target, new)
+            os.replace(made, target)
+        _sync_folder(folder)
+
+
+def _set_aside(path: Path, new: Path) -> None:
+    """Move what is there, if there is something, to ``new``, where it is removed."""
+    if os.path.lexists(path):
+        os.replace(path, Path(tempfile.mkdtemp(dir=new)) / path.name)
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    """Exchange two folders at once; False: the system or the file system cannot."""
+    if os.name != "posix":
+        return False
+    system = ctypes.CDLL(None)
+    both = os.fsencode(one), os.fsencode(other)
+    if hasattr(system, "renameat2"):  # Linux: RENAME_EXCHANGE
+        return bool(system.renameat2(_HERE, both[0], _HERE, both[1], 2) == 0)
+    if hasattr(system, "renamex_np"):  # macOS: RENAME_SWAP
+        return bool(system.renamex_np(*both, 2) == 0)
+    return False
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, a link, or a folder with all that is in it, as far as that is possible."""
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def is_own(path: Path) -> bool:
@@ -195,11 +285,15 @@ def _sync_folder(folder: Path) -> None:
     # Makes the rename durable. Windows cannot open folders, and some network file systems cannot
     # sync them. There the rename is still atomic, but it may reach the disk later.
     with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def write_bytes(path: Path | str, data: bytes | Iterable[bytes]) -> None:

@@ -6,9 +6,10 @@ import os
 import signal
 import stat
 import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 # Set while the main thread defers interrupts, and while one is deferred.
@@ -61,10 +62,12 @@ def ended_by_signals() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the process as Ctrl-C does, so that what is finished is saved.
 
     SIGTERM comes from a service manager, a batch system or a container, SIGHUP from a terminal that
-    is closed. Only the first one counts: several may come at once, and who is in a hurry sends
-    SIGKILL. A signal that is ignored stays ignored (`nohup`).
+    is closed. On Windows, SIGBREAK is both, and what `ask_to_end` sends. Only the first one counts:
+    several may come at once, and who is in a hurry sends SIGKILL. A signal that is ignored stays
+    ignored (`nohup`).
     """
-    names = ("SIGTERM", "SIGHUP") if threading.current_thread() is threading.main_thread() else ()
+    is_main = threading.current_thread() is threading.main_thread()
+    names = ("SIGTERM", "SIGHUP", "SIGBREAK") if is_main else ()
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     ours = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
 
@@ -73,7 +76,7 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(each, lambda *_: None)
         if number != signal.SIGTERM:
             _leave_terminal()
-        for child in _children:
+        for child in _children if sys.platform != "win32" else ():  # there the group gets it
             child.send_signal(number)
         if not _deferring.is_set():
             raise KeyboardInterrupt
@@ -86,6 +89,26 @@ def ended_by_signals() -> Iterator[None]:
     finally:
         for number in ours:
             signal.signal(number, signal.SIG_DFL)
+
+
+def of_own_group() -> dict[str, Any]:
+    """Arguments of `subprocess.Popen` for a process that outlives this one, for `ask_to_end`."""
+    if sys.platform == "win32":
+        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    return {"start_new_session": True}
+
+
+def ask_to_end(process: int) -> None:
+    """Ask a process of `of_own_group` to save what it has and to end; see `ended_by_signals`.
+
+    Windows has no SIGTERM: it would end at once, with nothing saved. Ctrl-Break reaches its group.
+    Raises: OSError: another user owns it.
+    """
+    number = signal.SIGTERM
+    if sys.platform == "win32":
+        number = signal.CTRL_BREAK_EVENT
+    with suppress(ProcessLookupError):  # it has ended
+        os.kill(process, number)
 
 
 def handle_again() -> None:

@@ -9,12 +9,13 @@ import pytest
 import torch
 from PIL import Image
 
+from snowsplat.project.site_folder import SiteFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.viewer.web.hiding import hiding_of
 from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description
-from snowsplat.viewer.web.publication import POSTER, write_site
+from snowsplat.viewer.web.publication import write_site
 from snowsplat.viewer.web.scene import ReadyScene, ready
 
 from ...browser import Browser, Page
@@ -99,7 +100,7 @@ def test_values_that_are_not_finite():
 def test_the_picture_of_a_link_shows_what_the_page_shows(tmp_path):
     scene = cloud()
     write_site(tmp_path, ready(scene, ()), Description("cloud"))
-    with Image.open(tmp_path / POSTER) as poster:
+    with Image.open(SiteFolder(tmp_path).poster()) as poster:
         corner = np.asarray(poster)[:200, :200]
     assert corner.max() < 20
     whole = ready(scene, ())

@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from snowsplat.pipeline.run.live_page import LivePage
@@ -34,6 +35,8 @@ from snowsplat.util.safe_json import from_json, parse_json
 FOLDER = ".snowsplat.watch"
 _SOCKET = "socket"
 _MOST = 1 << 16  # bytes of a line
+_OPEN_FILES = "/proc/self/fd"  # on Linux
+_MOST_PATH = 100  # bytes of the path of a socket; 103 on macOS, 107 on Linux
 _SEND_SECONDS = 1.0  # a watcher that does not read its reply is not waited for
 
 
@@ -59,8 +62,8 @@ class PageReply:
 def socket_in(output: Path, create: bool = False) -> Iterator[str]:
     """The path of the socket of a training, valid inside the context.
 
-    Paths of sockets have at most about 100 characters. On Linux, a short name of the open folder
-    takes the place of a longer path.
+    Paths of sockets have at most about 100 bytes. On Linux, a short name of the open folder takes
+    the place of a longer path, and elsewhere a link in a private folder for temporary files.
     Raises: OSError: there is no such folder, or other users can enter it or own it.
     """
     if create:
@@ -73,8 +76,16 @@ def socket_in(output: Path, create: bool = False) -> Iterator[str]:
         status = os.fstat(folder)
         if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
             raise PermissionError(f"{output / FOLDER} is not that of this user only")
-        own = Path(f"/proc/self/fd/{folder}")
-        yield str((own if own.exists() else output / FOLDER) / _SOCKET)
+        path, own = output / FOLDER / _SOCKET, Path(f"{_OPEN_FILES}/{folder}")
+        if own.exists():
+            yield str(own / _SOCKET)
+        elif len(os.fsencode(path)) <= _MOST_PATH:
+            yield str(path)
+        else:
+            with TemporaryDirectory(prefix="snow") as short:
+                link = Path(short) / "f"
+                link.symlink_to((output / FOLDER).absolute())
+                yield str(link / _SOCKET)
     finally:
         os.close(folder)
 

@@ -12,8 +12,8 @@ from PIL import Image
 
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.lod import INDEX
-from snowsplat.formats.lod_writer import remove_lod
 from snowsplat.formats.sog import write_sog
+from snowsplat.project.site_folder import PAGE, POSTER, SCENE, SiteFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.pixels import to_8bit
 from snowsplat.scene.render import render
@@ -23,15 +23,13 @@ from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import PICTURES, ReadyScene
 from snowsplat.viewer.web.viewer_page import asset, content_policy, page
 
-PAGE, SCENE, POSTER = "index.html", "scene.sog", "poster.jpg"
 #: The size that services recommend for the picture of a link (Open Graph).
 POSTER_SIZE = (1200, 630)
 
 
 def write_one_file(folder: Path, gaussians: Gaussians) -> str:
-    """Write the scene as a SOG file, and remove levels of detail of an earlier site."""
+    """Write the scene as a SOG file."""
     write_sog(folder / SCENE, GaussianArrays.from_gaussians(gaussians))
-    remove_lod(folder / INDEX)
     return SCENE
 
 
@@ -42,54 +40,58 @@ def write_site(
     url: str = "",
     write_scene: Callable[[Path, Gaussians], str] = write_one_file,
 ) -> None:
-    """Write the page, its viewer, the scene and a picture into a folder.
+    """Write the page, its viewer, the scene and a picture into a folder; see `SiteFolder`.
 
     Args:
-        folder: it must exist. Files of an earlier site are replaced.
+        folder: it must exist. An earlier site is replaced, at once.
         url: the address of the folder on the web, which ends in "/"; "" if it is not known yet.
             Services that show a preview of a link need it to find the picture.
-        write_scene: writes the scene into the folder, and returns the name of the file to load.
+        write_scene: writes the scene into a folder, and returns the name of the file to load.
 
     Raises:
+        UserError: another process writes this site.
         OSError: a file cannot be written.
     """
-    content = write_scene(folder, scene.gaussians)
-    if content == INDEX:
-        scene = scene.complete()
-    write_bytes(folder / POSTER, _poster(scene))
-    if scene.stops.views:
-        write_bytes(folder / PICTURES, scene.stops.pictures)
-    else:
-        (folder / PICTURES).unlink(missing_ok=True)  # of an earlier site
-    for name in ("index.css", "index.js"):
-        write_text(folder / name, asset(name))
-    write_text(folder / "viewer-licence.txt", asset("LICENSE"))
-    bootstrap = scene.bootstrap(about, f"./{PICTURES}")
+    content = ""
+
+    def write(files: Path) -> None:
+        nonlocal content, scene
+        content = write_scene(files, scene.gaussians)
+        if content == INDEX:
+            scene = scene.complete()
+        write_bytes(files / POSTER, _poster(scene))
+        if scene.stops.views:
+            write_bytes(files / PICTURES, scene.stops.pictures)
+        for name in ("index.css", "index.js"):
+            write_text(files / name, asset(name))
+        write_text(files / "viewer-licence.txt", asset("LICENSE"))
+
+    SiteFolder(folder).replace(write, lambda files: _page(scene, about, url, f"{files}/", content))
+
+
+def _page(scene: ReadyScene, about: Description, url: str, files: str, content: str) -> str:
+    """The page, which loads what is in the folder ``files`` beside it."""
+    bootstrap = scene.bootstrap(about, f"./{files}{PICTURES}")
     facts = about.facts(len(scene.gaussians))
-    bootstrap |= {"contentUrl": f"./{content}", "posterUrl": f"./{POSTER}"}
+    bootstrap |= {"contentUrl": f"./{files}{content}", "posterUrl": f"./{files}{POSTER}"}
     tags = _tags(
         {
             "og:type": "website",
             "og:title": about.title,
             "og:description": f"A scene in 3D: {facts}. Made with snowsplat.",
-            "og:image": url + POSTER,
+            "og:image": url + files + POSTER,
             "og:image:width": str(POSTER_SIZE[0]),
             "og:image:height": str(POSTER_SIZE[1]),
             **({"og:url": url} if url else {}),
             "twitter:card": "summary_large_image",
         }
     )
-    text = page(about.title, bootstrap, head=tags)
+    text = page(about.title, bootstrap, head=tags, files=files)
     # A host may send no headers, so the policy is in the page.
     policy = html.escape(content_policy(text, "'self'"))
     rule = f'<meta http-equiv="Content-Security-Policy" content="{policy}" />'
     charset = '<meta charset="UTF-8" />'
-    write_text(folder / PAGE, text.replace(charset, f"{charset}\n        {rule}", 1))
-
-
-def is_site(folder: Path) -> bool:
-    """Whether a folder contains a site that `write_site` has written."""
-    return (folder / PAGE).is_file() and any((folder / name).is_file() for name in (SCENE, INDEX))
+    return text.replace(charset, f"{charset}\n        {rule}", 1)
 
 
 def site_files(folder: Path) -> tuple[dict[str, Served], dict[str, str]]:

@@ -86,12 +86,14 @@ def panel_style() -> str:
     return with_colours((_PANEL / "panel.css").read_text(encoding="utf-8"))
 
 
-def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "") -> str:
+def page(
+    title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "", files: str = ""
+) -> str:
     """The page; its stylesheet and script are the separate files index.css and index.js.
 
     ``bootstrap`` has the viewer's keys: settings, contentUrl, contentFilename, posterUrl;
     antialiased, that of the Gaussians; and panel, see `panel.panel_settings`. ``head`` and ``body``
-    are HTML for these elements.
+    are HTML for these elements; ``files``: where the separate files are, "" or ending in "/".
     """
     text = asset("index.html")
     text = _replaced(
@@ -101,7 +103,9 @@ def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "
     icon = '<link rel="icon" href="data:," />'
     text = _replaced(text, '<base href="" />', f"{icon}\n        {head}" if head else icon)
     first = f"<style>\n{panel_style()}</style>\n        <script>\n{failure_script()}</script>"
-    text = _replaced(text, _STYLESHEET, f"{_STYLESHEET}\n        {first}")
+    stylesheet = _STYLESHEET.replace("./", f"./{files}")
+    text = _replaced(text, _STYLESHEET, f"{stylesheet}\n        {first}")
+    text = _replaced(text, _IMPORT, _IMPORT.replace("./", f"./{files}"))
     text = _replaced(text, "    <body>", f"    <body>\n        {_NO_SCRIPTS}")
     if body:
         text = _replaced(text, "    </body>", f"{body}\n    </body>")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -27,7 +26,7 @@ from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph, spread_subset
 from snowsplat.sfm.colmap.options import photos_with_adjustment
 from snowsplat.sfm.options import MIN_PHOTOS, Mapper
 from snowsplat.sfm.progress import Report
-from snowsplat.util.files import new_folder
+from snowsplat.util.files import new_entries, new_folder
 
 # A camera that sees fewer points has no reliable pose. The alignment of features reduces their
 # errors to a third; then fewer points are sufficient.
@@ -347,10 +346,8 @@ def usable_models(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Recons
 
 def write_models(models: list[pycolmap.Reconstruction], sparse: Path) -> None:
     """Write the models as ``sparse/0``, ``sparse/1`` …; replaces the whole folder."""
-    with new_folder(sparse.with_name(f".{sparse.name}.tmp")) as temporary:
+    with new_entries(sparse.parent, [sparse.name]) as new:
         for number, model in enumerate(models):
-            folder = temporary / str(number)
-            folder.mkdir()
+            folder = new / sparse.name / str(number)
+            folder.mkdir(parents=True)
             model.write(folder)
-        shutil.rmtree(sparse, ignore_errors=True)
-        temporary.rename(sparse)

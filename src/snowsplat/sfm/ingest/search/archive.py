@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from snowsplat.util.errors import Problem, UserError, cause_of
-from snowsplat.util.files import new_folder, shown
+from snowsplat.util.files import new_entries, shown
 from snowsplat.util.messages import Message, as_message, message
 
 # Other archives, by their first bytes. They are named, not unpacked.
@@ -181,10 +181,9 @@ def _extract_all(
             name=shown(folder.name),
             free=free / 1000000.0,
         )
-    with new_folder(folder.with_name(f".{folder.name}.{os.getpid()}.tmp")) as temporary:
+    with new_entries(folder.parent, [folder.name]) as new:
         for name, info in entries:
-            target = temporary / name
+            target = new / folder.name / name
             target.parent.mkdir(parents=True, exist_ok=True)
             with archive.open(info) as packed, open(target, "xb") as file:
                 shutil.copyfileobj(packed, file)
-        temporary.rename(folder)
