@@ -247,18 +247,27 @@ def test_masks_beside_the_images(dataset_copy):
         assert loader.get(views[1], 2).mask.all()
 
 
-@pytest.mark.parametrize("name", ["depths", "depth", "depth_maps"])
+@pytest.mark.parametrize("name", ["depths", "depth", "depth_maps", "mono_depth", "Depth_npy"])
 def test_depth_maps_beside_the_images(dataset_copy, name):
     folder = dataset_copy("colmap-bin")
     (folder / name).mkdir()
-    for file in ("view_01.png", "view_02.png.npy", "view_03.txt"):
+    for file in ("view_01.png", "view_02.png.npy", "view_03.txt", "view_04_aligned.npy"):
         (folder / name / file).touch()
     views = load_dataset(folder, hold_out=None).train
     names = {view.name: view.depth and view.depth.name for view in views}
     assert {name: depth for name, depth in names.items() if depth} == {
         "view_01.png": "view_01.png",
         "view_02.png": "view_02.png.npy",
+        "view_04.png": "view_04_aligned.npy",
     }
+
+
+def test_maps_of_no_photo_are_named(dataset_copy, caplog):
+    folder = dataset_copy("colmap-bin")
+    (folder / "normals").mkdir()
+    (folder / "normals" / "other.png").touch()
+    load_dataset(folder)
+    assert "normals: none of its files has the name of a photo; not used" in caplog.text
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n"])

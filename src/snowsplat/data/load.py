@@ -41,6 +41,8 @@ _SMALLEST_SIDE = 16
 # reconstruction: other trainers insist on a file of points, so people write some. So many points
 # are compared.
 _FEWEST_PLACES, _PLACES = 30, 1000
+# What programs add to the name of the photo of a map.
+_MAP_ENDS = ("", "_depth", "_normal", "_aligned")
 # To find the image circle of a lens: the number of photos, and their longer side in pixels.
 _CIRCLE_PHOTOS, _CIRCLE_SIDE = 12, 400
 
@@ -207,17 +209,27 @@ def _are_placeholder(points: Points) -> bool:
 def _with_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
     """The same images, with ``depths/IMG.png`` and ``normals/IMG.png`` of the folder, or
     ``IMG.jpg.png``, or files of other formats, as maps of ``IMG.jpg``."""
-    depths, normals = folders_of_maps(folder)
-    if depths is not None:
-        posed = [replace(image, depth=image.depth or _map_of(image, depths)) for image in posed]
-    if normals is not None:
-        posed = [replace(image, normals=_map_of(image, normals)) for image in posed]
+    for kind, maps in zip(("depth", "normals"), folders_of_maps(folder), strict=True):
+        if maps is None:
+            continue
+        found = [
+            replace(image, **{kind: getattr(image, kind) or _map_of(image, maps)})
+            for image in posed
+        ]
+        if not any(getattr(image, kind) for image in found):
+            logger.warning("%s: none of its files has the name of a photo; not used", maps)
+        posed = found
     return posed
 
 
 def _map_of(image: PosedImage, folder: Path) -> Path | None:
     stems = (str(Path(image.file).with_suffix("")), image.file)
-    names = (folder / (stem + suffix) for stem in stems for suffix in MAP_SUFFIXES)
+    names = (
+        folder / (stem + end + suffix)
+        for stem in stems
+        for end in _MAP_ENDS
+        for suffix in MAP_SUFFIXES
+    )
     return next((name for name in names if is_file(name)), None)
 
 

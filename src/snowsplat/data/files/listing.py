@@ -18,9 +18,9 @@ logger = logging.getLogger(__name__)
 # What is in a folder of this name. The name is compared without regard to case, and without "_" and
 # "." at its start and "_2", "_4" or "_8" at its end.
 _MASKS = re.compile(r"mask|(\w+_)?masks|(dynamic|images?)_mask|mask_images?")
-_DEPTHS = ("depths", "depth", "depth_maps", "depth_map", "depthmaps", "depthmap", "depth_images")
-_NORMALS = ("normals", "normal", "normal_maps", "normal_map", "normalmaps", "normal_images")
-_MAPS = {*_DEPTHS, *_NORMALS, "confidence", "confidences", "confidence_maps"}
+_OF_MAPS = r"(\w+_)?(mono_?)?{}s?(_?(maps?|images?|npy|aligned))?"
+_DEPTHS, _NORMALS = (re.compile(_OF_MAPS.format(kind)) for kind in ("depth", "normal"))
+_CONFIDENCES = re.compile("confidences?(_maps)?")
 _THUMBNAILS = {"thumb", "thumbs", "thumbnail", "thumbnails", "@eadir", "__macosx"}
 _DIVIDED = re.compile(r"(?P<original>.+)_[248]")
 #: Names of folders that say that there are photos inside, and not which ones.
@@ -56,16 +56,18 @@ def folder_kind(name: str) -> FolderKind:
     name = divided["original"] if divided else name
     if _MASKS.fullmatch(name):
         return "masks"
-    if name in _MAPS:
+    if any(names.fullmatch(name) for names in (_DEPTHS, _NORMALS, _CONFIDENCES)):
         return "maps"
     return "thumbnails" if name in _THUMBNAILS else "photos"
 
 
 def folders_of_maps(root: Path) -> tuple[Path | None, Path | None]:
-    """The folders of depth and of normal maps in a folder, by their usual names."""
+    """The folders of depth and of normal maps in a folder, by their usual names; the shortest."""
+    names = sorted(root.iterdir(), key=lambda path: (len(path.name), path.name))
+    folders = [path for path in names if path.is_dir()]
     depths, normals = (
-        next((root / name for name in names if (root / name).is_dir()), None)
-        for names in (_DEPTHS, _NORMALS)
+        next((path for path in folders if kind.fullmatch(path.name.casefold())), None)
+        for kind in (_DEPTHS, _NORMALS)
     )
     return depths, normals
 
