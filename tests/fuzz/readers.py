@@ -706,6 +706,24 @@ READERS: tuple[Reader, ...] = (
     _export("reconstruction.json", exports.opensfm, json=True),
     _export("cameras.sfm", exports.alicevision, json=True),
     _export("poses_bounds.npy", exports.llff),
+    _export("b.xmp", exports.realitycapture),
+    *(
+        _export(file, functools.partial(exports.matrices, layout=layout), file.endswith(".json"))
+        for file, layout in {
+            "pose/2.txt": "ScanNet",
+            "intrinsic/intrinsic_color.txt": "ScanNet",
+            "intrinsics.txt": "NSVF",
+            "poses.txt": "KITTI",
+            "calib.txt": "KITTI",
+            "cams/00000001_cam.txt": "MVSNet",
+            "cameras_sphere.npz": "IDR",
+            "groundtruth.txt": "TUM",
+            "traj.txt": "Replica",
+            "cam_params.json": "Replica",
+            "Barn.log": "Tanks and Temples",
+            "frame_00001.json": "3d Scanner App",
+        }.items()
+    ),
     Reader(
         "list of test images",
         "test.txt",
