@@ -29,6 +29,7 @@ from snowsplat.pipeline.train import train
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import Message
 from snowsplat.util.run_lock import InUse, one_run
 
 SETTINGS = {"iterations": 40, "max_gaussians": 600, "init": "points"}
@@ -207,14 +208,14 @@ def test_any_order_elsewhere_and_interrupted_gives_the_same_scene(planned, train
     folder = planned.parent / "again"  # beside the dataset, because links are relative
     shutil.copytree(planned, folder, symlinks=True)
     plan = Plan.read(folder)
-    lines: list[str] = []
+    lines: list[Message] = []
     with one_run(folder / "block_02"):
         results = train_blocks(folder, [3, 2], on_block=lines.append)
         with pytest.raises(InUse, match=rf"block_02: in use by process {os.getpid()} on "):
             train_blocks(folder, [2])
     assert len(results) == 1
-    assert "block_02: in use by" in lines[0]
-    assert lines[1].startswith("block_03: ")
+    assert "block_02: in use by" in str(lines[0])
+    assert str(lines[1]).startswith("block_03: ")
     with pytest.raises(UserError, match=r"block_01: not trained; run .* `block` 1"):
         merge_blocks(folder)
 
@@ -239,9 +240,9 @@ def test_any_order_elsewhere_and_interrupted_gives_the_same_scene(planned, train
 
     lines.clear()
     train_blocks(folder, on_block=lines.append)
-    assert lines[0] == "block_01: finished"
-    assert lines[1].startswith("block_02: ")
-    assert lines[2] == "block_03: finished"
+    assert str(lines[0]) == "block_01: finished"
+    assert str(lines[1]).startswith("block_02: ")
+    assert str(lines[2]) == "block_03: finished"
     merge_blocks(folder, tmp_path / "scene.ply")
     expected = trained / "point_cloud" / "iteration_40" / "point_cloud.ply"
     assert (tmp_path / "scene.ply").read_bytes() == expected.read_bytes()

@@ -47,9 +47,7 @@ class Benchmark(JsonCommand):
         """The exit code is 2 if a scene could not be trained."""
         from snowsplat.pipeline.benchmark.run import benchmark
 
-        report = benchmark(
-            self.folder, self.output, self.options, on_line=lambda line: print(line, flush=True)
-        )
+        report = benchmark(self.folder, self.output, self.options, on_line=print_message)
         print_message(
             "\n{report}\n\n{output}: the results as a page",
             report=report,

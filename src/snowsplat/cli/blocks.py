@@ -125,7 +125,7 @@ class Blocks(Command):
                     compute=self.training.compute,
                     memory=self.training.memory,
                     observer=observer,
-                    on_block=lambda line: print(line, flush=True),
+                    on_block=print_message,
                 )
             except TrainingStopped as stopped:
                 print_message("{stopped}; continue with the same command", stopped=stopped)

@@ -120,7 +120,8 @@ def make(
     if options.compute.device is not None:  # report an unusable device before the long stages
         options.compute.apply()
     with one_run(out):
-        _check_free(out)
+        remove_temporaries(out, (MAKE_RECORD,))
+        check_output(out, lambda entry: entry.name == LOCK or (out / MAKE_RECORD).is_file())
         stages = Stages(out / MAKE_RECORD, STAGES)
         with _removed_if_alone(out):
             sources = find_sources(paths)
@@ -132,12 +133,6 @@ def make(
                 out, name, sources, given, stages, options, overwrite, observer, page, started
             )
             return job.run()
-
-
-def _check_free(out: Path) -> None:
-    """Raises UserError if the folder contains files that `make` has not written."""
-    remove_temporaries(out, (MAKE_RECORD,))
-    check_output(out, lambda entry: entry.name == LOCK or (out / MAKE_RECORD).is_file())
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
 from snowsplat.pipeline.options.benchmark import BenchmarkOptions
 from snowsplat.util.errors import SettingError, UserError
-from snowsplat.util.messages import as_message
+from snowsplat.util.messages import Message, as_message, message
 from snowsplat.util.run_lock import InUse
 
 
@@ -25,7 +25,7 @@ def benchmark(
     output: Path | str,
     options: BenchmarkOptions | None = None,
     *,
-    on_line: Callable[[str], None] = lambda line: None,
+    on_line: Callable[[Message], None] = lambda line: None,
 ) -> BenchmarkReport:
     """Train and evaluate all scenes of a folder, by the protocol of a benchmark suite.
 
@@ -57,7 +57,14 @@ def benchmark(
         except UserError as error:
             raise SettingError("lpips", as_message(error)) from None
     output.mkdir(parents=True, exist_ok=True)
-    on_line(f"{SUITES[name].title}: {len(jobs)} scenes, {len(finished)} finished")
+    on_line(
+        message(
+            "{suite}: {scenes} scenes, {finished} finished",
+            suite=SUITES[name].title,
+            scenes=len(jobs),
+            finished=len(finished),
+        )
+    )
     waiting = [job for job in jobs if job.scene not in finished]
     failures, elsewhere = _run_all(waiting, options, on_line)
     results = [result for job in jobs if (result := SceneResult.read(job)) is not None]
@@ -106,7 +113,7 @@ def _job(dataset: Path, output: Path, name: str, options: BenchmarkOptions) -> J
 
 
 def _run_all(
-    jobs: Sequence[Job], options: BenchmarkOptions, on_line: Callable[[str], None]
+    jobs: Sequence[Job], options: BenchmarkOptions, on_line: Callable[[Message], None]
 ) -> tuple[dict[str, str], list[InUse]]:
     """Run the jobs that nobody else runs; returns the errors by scene, and who runs the others."""
     devices = _devices(options)
@@ -123,20 +130,28 @@ def _run_all(
             run(job, device, threads)
         except InUse as error:
             elsewhere.append(error)
-            on_line(str(error))
+            on_line(error.message)
             return
         except UserError as error:
             failures[job.scene] = str(error)
-            on_line(str(error))
+            on_line(error.message)
             return
         finally:
             devices.append(device)
         result = SceneResult.read(job)
         assert result is not None
         on_line(
-            f"{job.scene}: {result.psnr:.2f} dB at {result.size[0]}x{result.size[1]}, "
-            f"SSIM {result.ssim:.4f}, "
-            f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s"
+            message(
+                "{scene}: {psnr:.2f} dB at {width}x{height}, SSIM {ssim:.4f}, {gaussians:,} "
+                "Gaussians, {seconds:.0f} s",
+                scene=job.scene,
+                psnr=result.psnr,
+                width=result.size[0],
+                height=result.size[1],
+                ssim=result.ssim,
+                gaussians=result.gaussians,
+                seconds=result.seconds,
+            )
         )
 
     with ThreadPoolExecutor(options.jobs) as pool:

@@ -13,6 +13,7 @@ from snowsplat.pipeline.run.train_result import TrainResult
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import DATASET, SCENE, TrainingFolder
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.messages import Message, message
 from snowsplat.util.run_lock import InUse, one_run
 
 _CHECKPOINT_SECONDS = 60.0
@@ -44,7 +45,7 @@ def train_blocks(
     compute: Compute | None = None,
     memory: int | str | None = None,
     observer: Observer = SILENT,
-    on_block: Callable[[str], None] = lambda line: None,
+    on_block: Callable[[Message], None] = lambda line: None,
 ) -> list[TrainResult]:
     """Train the blocks of a plan, in this order, except those that are finished.
 
@@ -81,17 +82,24 @@ def train_blocks(
             continue
         out = scene_folder(folder, block)
         if is_finished(out):
-            on_block(f"{block.name}: finished")
+            on_block(message("{name}: finished", name=block.name))
             continue
         try:
             with one_run(folder / block.name):
                 if not is_finished(out):  # by another process, a moment ago
-                    on_block(f"{block.name}: {block.views} photos, {block.points:,} points")
+                    on_block(
+                        message(
+                            "{name}: {views} photos, {points:,} points",
+                            name=block.name,
+                            views=block.views,
+                            points=block.points,
+                        )
+                    )
                     compute = compute or Compute()
                     results.append(_train(folder, plan, block, compute, memory, observer))
         except InUse as error:
             elsewhere.append(error)
-            on_block(str(error))
+            on_block(error.message)
     if elsewhere and not results:
         raise elsewhere[0]
     return results
