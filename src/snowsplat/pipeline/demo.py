@@ -66,8 +66,7 @@ def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
 
 
 def _take_photos(folder: Path, observer: Observer) -> Truth:
-    before = len(list(folder.glob("*.jpg")))
-    started = time.monotonic()
+    before, started = len(list(folder.glob("*.jpg"))), time.monotonic()
     truth = write_synthetic_photos(folder, report=observer.begin("demo"))
     total = len(truth.poses)
     outcome = Outcome({"photos": total}, time.monotonic() - started, before == total)

@@ -205,8 +205,7 @@ class _Video:
         width, height = first.width, first.height
         files = self._files()
         with torch.no_grad(), ExitStack() as stack:
-            started = time.monotonic()
-            report = observer.begin("video")
+            started, report = time.monotonic(), observer.begin("video")
             self.file.parent.mkdir(parents=True, exist_ok=True)
             remove_temporaries(self.file.parent, [file.name for file, _ in files])
             near, far = self._depth_range()

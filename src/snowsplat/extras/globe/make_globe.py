@@ -83,8 +83,7 @@ def make_globe(
 
 
 def _write(video: GlobeVideo, file: Path, observer: Observer) -> None:
-    started = time.monotonic()
-    report = observer.begin("video")
+    started, report = time.monotonic(), observer.begin("video")
     with video_writer(file, video.width, video.height, video.fps) as add:
         for i, frame in enumerate(video.frames()):
             add(frame)

@@ -128,13 +128,12 @@ def _run_all(
         device = devices.pop()
         try:
             run(job, device, threads)
-        except InUse as error:
-            elsewhere.append(error)
-            on_line(error.message)
-            return
         except UserError as error:
-            failures[job.scene] = str(error)
             on_line(error.message)
+            if isinstance(error, InUse):
+                elsewhere.append(error)
+            else:
+                failures[job.scene] = str(error)
             return
         finally:
             devices.append(device)
