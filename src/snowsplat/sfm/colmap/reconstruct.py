@@ -228,7 +228,7 @@ class PoseEstimation:
         one, best = self.photos, self._best()
         if lens.any_fisheye or not camera_groups.may_differ(one):
             return
-        if not self._enough:
+        if not self._good:  # bundle adjustment of a bent model does not find a zoom
             pinhole = Lens("SIMPLE_PINHOLE", exif=lens.exif)
             set_cameras(self.matched.database, camera_groups.separate(one), pinhole)
             models = self.runner.mapping(self.matched, pinhole).run("incremental")
