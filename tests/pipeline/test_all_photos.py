@@ -4,11 +4,13 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from snowsplat.data import load_dataset
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.pipeline import all_photos
 from snowsplat.pipeline.all_photos import train_on_all
 from snowsplat.pipeline.compute import Compute
@@ -19,7 +21,9 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.history import History
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts import transients
 from snowsplat.training.parts.exposure import Exposure
+from snowsplat.training.parts.transients import KnownTransients
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.schedule import Schedule
 
@@ -96,5 +100,37 @@ def test_the_mean_of_the_exposures_stays_where_it_is(trained):
 def test_when_there_is_no_last_part(trained):
     compute = Compute("cpu", 1)
     assert "less than twice" in str(train_on_all(trained, 200, 1e-9, compute, SILENT)[0].why_not)
+
+
+def test_what_moves_is_masked_in_all_photos(trained, monkeypatch):
+    """Also in the held-out ones. Something is found in the first and in the last photo."""
+    found = []
+
+    def moving(maps, before, mode):
+        cells = [torch.zeros_like(each.usable) for each in maps]
+        cells[0][1, 2] = cells[-1][2, 3] = True
+        found.append((len(maps), mode))
+        return cells
+
+    trainers = []
+
+    def remember(*arguments, **options):
+        trainers.append(Trainer(*arguments, **options))
+        trainers[-1].run = lambda on_progress: None
+        return trainers[-1]
+
+    monkeypatch.setattr(transients, "_moving_cells", moving)
+    monkeypatch.setattr(all_photos, "Trainer", remember)
+    train_on_all(trained, 200, math.inf, Compute("cpu", 1), SILENT)
+    assert trainers[0].part(KnownTransients) is None
     Path(trained.path / "masks").mkdir()
-    assert "moves" in str(train_on_all(trained, 200, math.inf, compute, SILENT)[0].why_not)
+    part, _ = train_on_all(trained, 200, math.inf, Compute("cpu", 1), SILENT)
+    assert (part.photos, found) == (8, [(8, "on")])
+    photo = LoadedImage(torch.zeros(3, 36, 48, dtype=torch.uint8))
+    known = trainers[1].part(KnownTransients)
+    masks = [known.target(trainers[1], SimpleNamespace(index=i), photo).mask for i in range(8)]
+    expected = torch.ones(36, 48, dtype=torch.bool)
+    expected[9:18, 16:24] = False
+    assert torch.equal(masks[0], expected)
+    assert masks[7] is not None
+    assert masks[1:7] == [None] * 6

@@ -48,7 +48,9 @@ def test_progress_and_verdict():
         *described("pictures", {}),
         *described("all", {"steps": 90, "photos": 50}),
         *described("all", {"steps": 90, "photos": 50, "left_out": 2}),
-        *described("all", {"steps": 0, "why_not": message("something moves in the photos")}),
+        *described(
+            "all", {"steps": 0, "why_not": message("it would use each photo less than twice")}
+        ),
         Verdict.of([reason]).head(message("the scene")),
         *("registered photos", "photos with features", "matched pairs", "verified pairs"),
     ]

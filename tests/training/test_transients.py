@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from PIL import Image
 
 from snowsplat import Dataset, Gaussians, TrainConfig, Trainer, load_dataset, ops, recipe
 from snowsplat.data.photos.decode import LoadedImage, load_image
+from snowsplat.evaluation.renderings import Rendering
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import render
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
@@ -23,9 +25,8 @@ from snowsplat.training.parts.transients import (
     MOMENTS,
     Transients,
     cells_that_move,
-    large_residual,
 )
-from snowsplat.training.parts.view_residuals import CellMap, residuals_elsewhere
+from snowsplat.training.parts.view_residuals import CELL, CellMap, Witnesses, cell_map, witnesses
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.util.errors import UserError
@@ -94,121 +95,198 @@ def assert_identical(a: Gaussians, b: Gaussians) -> None:
 # The rule
 
 
-#: A large residual in one view, where nothing moved before, judged by the other views only.
-RULE = 0.1, torch.zeros(12, 16, dtype=torch.bool), False
 CAMERA = Camera(16, 12, 12.0, 12.0, 8.0, 6.0, torch.eye(3, 4, dtype=torch.float64))
+#: Where something is in the photo.
+THING = slice(4, 8), slice(5, 9)
 
 
 def cells(value: float) -> torch.Tensor:
     return torch.full((12, 16), value)
 
 
-def view(residual: torch.Tensor, correlation: float = 0.0) -> CellMap:
+def view(
+    residual: torch.Tensor,
+    correlation: float = 0.0,
+    colors: torch.Tensor | None = None,
+    camera: Camera = CAMERA,
+    noise: float = 0.02,
+) -> CellMap:
     """The detail of the photo is not that of the rendering, if the correlation is small."""
-    return CellMap(residual, cells(correlation), DepthMap(CAMERA, cells(0.5)))
+    colors = torch.zeros(3, 12, 16) if colors is None else colors
+    usable, places = torch.ones(12, 16, dtype=torch.bool), DepthMap(camera, cells(0.5))
+    return CellMap(residual, noise, cells(correlation), colors, usable, places)
 
 
-def test_a_large_residual_in_one_view_only():
-    residual, elsewhere, others = cells(0.02), cells(0.02), cells(6.0)
-    residual[4:8, 5:9] = 0.3
-    found = cells_that_move(view(residual), elsewhere, others, *RULE)
+def thing(outside: float, inside: float) -> torch.Tensor:
+    values = cells(outside)
+    values[THING] = inside
+    return values
+
+
+def said_by_six(**inside: int) -> Witnesses:
+    """Six photos show each cell at the same size and explain it; none contradicts outside of the
+    thing.
+    """
+    usual = {"others": 6, "explained": 6, "comparable": 6, "contradicting": 0}
+    counts = usual | {"contradicting": 6} | inside
+    return Witnesses(*(thing(usual[name], counts[name]).to(torch.int64) for name in usual))
+
+
+def test_a_photo_that_contradicts_two_others_which_agree():
+    found = cells_that_move(view(thing(0.02, 0.3)), said_by_six())
     expected = torch.zeros(12, 16, dtype=torch.bool)
     expected[3:9, 4:10] = True  # and the cells around
     assert torch.equal(found, expected)
 
 
 @pytest.mark.parametrize(
-    "reason", ["elsewhere too", "few others", "alone", "small", "in another light"]
+    ("moves", "counts"),
+    [
+        (True, {"comparable": 2, "contradicting": 2}),
+        (True, {"contradicting": 5}),
+        # Gloss, seen by some of the photos.
+        (False, {"contradicting": 4}),
+        # Two photos, and nobody says which of them is wrong.
+        (False, {"others": 1, "explained": 1, "comparable": 1, "contradicting": 1}),
+        # Nobody else has seen it.
+        (False, {"others": 0, "explained": 0, "comparable": 0, "contradicting": 0}),
+        # The scene explains this place in few photos: it is wrong, not this photo.
+        (False, {"explained": 4}),
+        # Photos from farther away do not show its detail.
+        (False, {"comparable": 0, "contradicting": 0}),
+    ],
 )
+def test_who_is_wrong(moves, counts):
+    found = cells_that_move(view(thing(0.02, 0.3)), said_by_six(**counts))
+    assert bool(found.any()) == moves
+
+
+@pytest.mark.parametrize("reason", ["noisy photo", "alone", "in another light"])
 def test_what_does_not_move(reason):
-    residual, elsewhere, others = cells(0.02), cells(0.02), cells(6.0)
-    residual[4:8, 5:9] = 0.3
-    if reason == "elsewhere too":
-        elsewhere[4:8, 5:9] = 0.15
-    elif reason == "few others":
-        others[4:8, 5:9] = 1.0
+    residual, noise = thing(0.02, 0.3), 0.02
+    if reason == "noisy photo":  # as close to a surface that is not sharp yet
+        noise = 0.16
     elif reason == "alone":
-        residual[:] = 0.02
+        residual = cells(0.02)
         residual[5, 6] = 0.5
-    elif reason == "small":
-        residual[4:8, 5:9] = 0.08
-    seen = view(residual, 0.8 if reason == "in another light" else 0.0)
-    assert not cells_that_move(seen, elsewhere, others, *RULE).any()
+    correlation = 0.8 if reason == "in another light" else 0.0
+    assert not cells_that_move(view(residual, correlation, noise=noise), said_by_six()).any()
 
 
-@pytest.mark.parametrize("first", [12, 15])
-@pytest.mark.parametrize("reason", ["found", "a single row", "nothing is shown there"])
-def test_a_place_in_no_other_view_is_judged_by_its_own(first, reason):
-    """What is at the border of the photo, also in one column, continues beyond it."""
-    residual, elsewhere, others = cells(0.02), cells(torch.inf), cells(0.0)
-    rows = slice(4, 5 if reason == "a single row" else 8)
-    residual[rows, first:] = 0.3
-    seen = view(residual)
-    if reason == "nothing is shown there":
-        seen.places.inverse_depth[rows, first:] = 0.0
-    found = cells_that_move(seen, elsewhere, others, *RULE[:2], True)
-    expected = torch.zeros(12, 16, dtype=torch.bool)
-    expected[3:9, first - 1 :] = reason == "found"
-    assert torch.equal(found, expected)
-    assert not cells_that_move(seen, elsewhere, others, *RULE).any()
+@pytest.mark.parametrize(("others", "continues"), [(6, True), (0, True), (3, False)])
+def test_a_thing_continues_where_the_other_photos_do_not_say_otherwise(others, continues):
+    """It is as wide as the photo, but only its middle is contradicted: ``others`` of six photos, or
+    none, are explained beside it.
+    """
+    residual = thing(0.02, 0.3)
+    residual[4:8] = 0.3
+    said = said_by_six()
+    beside = torch.zeros(12, 16, dtype=torch.bool)
+    beside[4:8] = True
+    beside[THING] = False
+    said.explained[beside] = others
+    said.others[beside] = 6 if others else 0
+    said.comparable[beside] = said.contradicting[beside] = 0
+    found = cells_that_move(view(residual), said)
+    assert found[4:8, 4:10].all()
+    assert bool(found[4:8].all()) == continues
 
 
-@pytest.mark.parametrize(("elsewhere", "alone"), [(0.02, True), (0.02, False), (0.15, True)])
-def test_one_other_view_judges_if_something_moves_in_several_photos(elsewhere, alone):
-    residual, others = cells(0.02), cells(1.0)
-    residual[4:8, 5:9] = 0.3
-    found = cells_that_move(view(residual), cells(elsewhere), others, *RULE[:2], alone)
-    assert found.any() == (alone and elsewhere == 0.02)
+def test_the_noise_of_a_photo():
+    """That of its residuals, of which a sixth is something else; at least that of its encoding."""
+    generator = torch.Generator().manual_seed(0)
+    error = 0.05 * torch.randn(12, 16, generator=generator).expand(3, -1, -1)
+    error = error.repeat_interleave(CELL, 1).repeat_interleave(CELL, 2)
+    error[:, : 2 * CELL] = 0.4
+
+    def noise(error: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+        shape = error.shape[1:]
+        camera = CAMERA.scaled(shape[1], shape[0])
+        picture = torch.linspace(0.3, 0.7, shape[1]).expand(3, *shape)
+        planes = torch.ones(shape)
+        output = SimpleNamespace(image=picture.permute(1, 2, 0), alpha=planes, depth=2.0 * planes)
+        photo = (picture + error).permute(1, 2, 0)
+        view = SimpleNamespace(camera=camera)
+        return cell_map(Rendering(view, output.image, photo, mask, output)).noise
+
+    assert noise(error) == pytest.approx(0.06, abs=0.02)
+    assert noise(torch.zeros_like(error)) == pytest.approx(0.01)
+    assert noise(error, torch.zeros(error.shape[1:], dtype=torch.bool)) == math.inf
 
 
-def test_the_edges_of_a_thing_may_have_a_smaller_residual():
-    residual, elsewhere, others = cells(0.01), cells(0.01), cells(6.0)
-    residual[4:8, 2:12] = 0.07
-    residual[4:8, 5:9] = 0.3
-    assert cells_that_move(view(residual), elsewhere, others, *RULE)[4:8, 2:12].all()
-
-
-def test_a_thing_remains_masked_while_its_residual_is_notable():
-    residual, elsewhere, others = cells(0.02), cells(0.02), cells(1.0)
-    residual[4:8, 5:9] = 0.12
-    before = torch.zeros(12, 16, dtype=torch.bool)
-    assert not cells_that_move(view(residual), elsewhere, others, 0.1, before, False).any()
-    before[5, 6] = True
-    assert cells_that_move(view(residual), elsewhere, others, 0.1, before, False)[4:8, 5:9].all()
-
-
-def test_residuals_of_the_same_places_in_other_views():
-    """Two views side by side: the second one shows the first one's cells one column further."""
+def moved(cells_right: float) -> Camera:
+    """A camera that shows what is at the depth 2 so many cells further to the right."""
     pose = CAMERA.cam_from_world.clone()
-    pose[0, 3] = 2.0 / 12.0  # one cell at the depth 2
-    first, second = (
-        CellMap(
-            torch.arange(192.0).reshape(12, 16) + offset,
-            cells(1.0),
-            DepthMap(replace(CAMERA, cam_from_world=p), cells(0.5)),
-        )
-        for offset, p in ((0.0, CAMERA.cam_from_world), (1000.0, pose))
-    )
+    pose[0, 3] = 2.0 * cells_right / 12.0
+    return replace(CAMERA, cam_from_world=pose)
+
+
+def said_of_first(*maps: CellMap, ignored: torch.Tensor | None = None) -> Witnesses:
+    there = [torch.zeros(12, 16, dtype=torch.bool) for _ in maps]
+    if ignored is not None:
+        there[1] = ignored
+    return witnesses(maps, there)[0]
+
+
+def test_what_the_other_photos_say_of_a_place():
+    """The second one shows it one column further; one of its colours is not that of the first."""
+    colors = torch.rand(3, 12, 16, generator=torch.Generator().manual_seed(1)) * 0.02
+    wrong = colors.roll(1, 2)
+    wrong[1, 2:9, 3:10] += 0.5
+    first = view(cells(0.0), colors=colors)
+    second = view(cells(0.0), colors=wrong, camera=moved(1))
     second.places.inverse_depth[3, 5] = 1.0  # something nearer hides this place
-    ignored = torch.zeros(2, 12, 16, dtype=torch.bool)
-    ignored[1, 7, 9] = True
-    usual, others = residuals_elsewhere([first, second], list(ignored))[0]
-    expected = second.residual.roll(-1, 1)
-    expected[:, 15] = expected[3, 4] = expected[7, 8] = torch.inf
-    torch.testing.assert_close(usual, expected)
-    assert torch.equal(others, expected.isfinite().to(others.dtype))
+    second.usable[10, 2] = False
+    second.residual[5, 6] = 0.5  # the scene does not explain it
+    ignored = torch.zeros(12, 16, dtype=torch.bool)
+    ignored[11, 9] = True
+    said = said_of_first(first, second, ignored=ignored)
+    shown = torch.ones(12, 16, dtype=torch.int64)
+    shown[:, 15] = shown[3, 4] = shown[10, 1] = shown[11, 8] = 0
+    assert torch.equal(said.others, shown)
+    assert torch.equal(said.comparable, shown)
+    explained = shown.clone()
+    explained[5, 5] = 0
+    assert torch.equal(said.explained, explained)
+    # All of the colours around the place there differ.
+    contradicting = torch.zeros_like(shown)
+    contradicting[3:8, 3:8] = explained[3:8, 3:8]
+    assert torch.equal(said.contradicting, contradicting)
+
+
+def test_an_error_of_a_cell_is_no_contradiction():
+    """A checkerboard, whose place the pose of the second photo misses by a cell."""
+    colors = ((torch.arange(12)[:, None] + torch.arange(16)) % 2).float().expand(3, -1, -1)
+    first = view(cells(0.0), colors=colors.contiguous())
+    second = view(cells(0.0), colors=colors.contiguous(), camera=moved(1))
+    assert not said_of_first(first, second).contradicting.any()
+
+
+def test_a_contradiction_is_larger_than_the_usual_difference_of_the_photos():
+    """Half of the cells differ by 0.3 between these photos: then it is no evidence."""
+    colors = torch.zeros(3, 12, 16)
+    colors[:, :, 10:] = 0.3
+    first, second = view(cells(0.0)), view(cells(0.0), colors=colors)
+    assert said_of_first(first, second).contradicting[:, 11:].all()
+    colors[:, :, 4:] = 0.3
+    assert not said_of_first(first, second).contradicting.any()
+
+
+@pytest.mark.parametrize(("depth", "comparable"), [(1.6, True), (3.6, True), (4.4, False)])
+def test_photos_of_another_size_of_the_place_do_not_contradict(depth, comparable):
+    pose = CAMERA.cam_from_world.clone()
+    pose[2, 3] = depth - 2.0
+    other = replace(CAMERA, cam_from_world=pose)
+    colors = torch.zeros(3, 12, 16)
+    colors[:, 5:8, 7:10] = 1.0
+    second = view(cells(0.0), colors=colors, camera=other)
+    second.places.inverse_depth[:] = 1.0 / depth
+    said = said_of_first(view(cells(0.0)), second)
+    assert said.others[6, 8] == 1
+    assert bool(said.comparable[6, 8]) == bool(said.contradicting[6, 8]) == comparable
 
 
 # The masks
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("moving", [0.0, 0.05, 0.2, 0.4])
-def test_people_in_a_tenth_of_all_cells_do_not_hide_themselves(moving):
-    """Static cells have residuals of 0.02 to 0.06, those that show people 0.5."""
-    still = torch.linspace(0.02, 0.06, 1000)
-    people = torch.full((round(1000 * moving / (1.0 - moving)),), 0.5)
-    assert 0.1 <= large_residual([still[:400], torch.cat([still[400:], people])]) <= 0.25
 
 
 def test_what_moves_is_found(trained):

@@ -23,6 +23,8 @@ from snowsplat.scene.render import render
 from snowsplat.training.core.history import History
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
+from snowsplat.training.parts.list import parts_of
+from snowsplat.training.parts.transients import KnownTransients
 from snowsplat.training.parts.unexplained import unexplained_views
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.rates import DecayRates
@@ -56,9 +58,9 @@ def train_on_all(
     """Continue a finished training with all photos; writes nothing.
 
     Photos that the training has left out remain so, and so do held-out photos that the scene does
-    not explain. There is no last part if something moves in the photos, because it is not known in
-    the held-out ones, or if there are fewer than `_LOOKS` steps for each photo: with many photos,
-    or little time, the last part would change little.
+    not explain. If something moves in the photos, it is masked in all of them. There is no last
+    part if there are fewer than `_LOOKS` steps for each photo: with many photos, or little time,
+    the last part would change little.
 
     Returns: what was done, and the scene; None if there was no last part.
 
@@ -68,8 +70,6 @@ def train_on_all(
 
     Raises: UserError: scene, settings, dataset or a photo are missing or damaged.
     """
-    if folder.masks.is_dir():
-        return LastPart(why_not=message("something moves in the photos")), None
     scene = load_trained(folder.path, iteration=iteration, compute=compute)
     left_out = {each.photo for each in folder.left_out()}
     used = [view for view in scene.dataset.train if view.name not in left_out]
@@ -100,6 +100,7 @@ def train_on_all(
         config,
         device=background.device,
         initial=scene.gaussians.clone(),
+        parts=[*parts_of(config), *([KnownTransients()] if folder.masks.is_dir() else [])],
     )
     exposure = trainer.part(Exposure)
     if exposure is not None:

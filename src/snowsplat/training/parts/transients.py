@@ -2,19 +2,27 @@
 
 The scene is static. A thing that moves has another place in each photo, or is in only one of them.
 The scene can reproduce it only by fog in front of the camera. So such a thing is masked in its
-photo, as by a mask of the user. It is found by four properties:
+photo, as by a mask of the user.
 
-- the residual of its cells is large (see `view_residuals`);
-- the residuals of the same places in other photos are small. This is the difference to what the
-  scene does not explain yet, such as thin or shiny things: they are wrong in most photos;
+That a photo differs from the scene does not tell who is wrong: the scene may not explain this place
+yet. So two photos that show the same place must contradict each other, and a third one must agree
+with one of them. In units of the noise of these photos (see `view_residuals`), something moves in a
+cell if
+
+- its residual is notable;
+- most of the photos that show the same place at the same size, and at least two of them, have
+  significantly other colours there, and the scene explains them. Things that are thin, shiny or too
+  early in the training are wrong in most photos; nobody confirms what one other photo shows;
 - the photo does not correlate with the rendering. This is the difference to shadows and gloss on a
   surface, whose detail remains;
 - most of the cells around it have these properties, too (patches as in RobustNeRF, Sabour et al.
   2023).
 
-If several photos have such a thing, smaller residuals are enough, and the photos are compared again
-without it. Then places that only one other photo shows are judged, too, and those that no other
-photo shows, by their own photo.
+The thing that moves continues over the cells around with a notable residual and without
+correlation, unless the other photos are not explained there either. A place that no other photo
+shows is never masked without such a beginning: what is not seen twice does not contradict.
+
+If something moves in several photos, the photos are compared again without it.
 
 The masks are computed anew at a few moments. A place that is masked by mistake is still trained by
 the other photos, so it is not masked the next time. As in RobustSplat (Fu et al. 2025), Gaussians
@@ -41,9 +49,10 @@ from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.part_report import PartReport, Section
 from snowsplat.training.parts.view_residuals import (
     CellMap,
+    Witnesses,
     cell_map,
     cell_size,
-    residuals_elsewhere,
+    witnesses,
 )
 from snowsplat.training.processes.shards import sharded_render
 from snowsplat.training.settings.config import AutoOnOff
@@ -62,23 +71,14 @@ _FEWEST_VIEWS = {"auto": 30, "on": 8, "off": 0}
 _STEPS_PER_VIEW = 8
 #: With "auto", if nothing moves after this moment, the photos are not compared again.
 _NOTHING = MOMENTS[1]
-#: The residual of a cell is large if it is at least this, and at least this many times one of two
-#: quantiles of the residuals of all cells. Early in the training, all residuals are larger. If what
-#: moves covers more than a tenth of the photos, the higher quantile is a residual of it, but the
-#: median is not.
-_LARGE, _TIMES_QUANTILE = 0.1, ((2.0, 0.9), (4.0, 0.5))
-#: Around cells with a large residual, this share of it is enough, up to this number of cells away.
-_NOTABLE, _RINGS = 0.5, 3
-#: If something moves in several photos, this share of a large residual is enough.
-_LESS = 0.8
-#: It must be this many times the residual of the same place in other views, ...
-_TIMES = 3.0
-#: ... of which there must be at least this number. If something moves in several photos, one other
-#: view is enough, and with none the photo is judged alone.
-_FEWEST_OTHERS = 2
+#: The residual must be at least this number of its standard deviations in the photo.
+_NOTABLE = 2.0
+#: This share of the photos that show a place must contradict, and at least this number. Gloss and
+#: shadows also change between some of the photos.
+_MOST, _FEWEST_OTHERS = 0.75, 2
 #: The same surface in another light has at least this correlation with its rendering.
 _SAME_DETAIL = 0.5
-#: The share of the 3 × 3 cells around a cell that must have a large residual.
+#: The share of the 3 × 3 cells around a cell that must contradict.
 _VOTES = 0.5
 #: With "auto", a photo counts if this share of its cells are found. Things move in the scene if at
 #: least this number of photos and this share of all photos count.
@@ -150,13 +150,7 @@ class Transients(Part):
 
     def target(self, run: Run, view: BatchView, photo: LoadedImage) -> LoadedImage:
         """The photo, at any size, with the mask of the user and that of what moves."""
-        cells = self.masks[view.index]
-        if self._mode == "off" or bool(cells.all()):
-            return photo
-        size = photo.planes.shape[1:]
-        cells = cells.to(photo.planes.device, non_blocking=True)
-        mask = interpolate(cells[None, None].to(torch.uint8), size)[0, 0].to(torch.bool)
-        return replace(photo, mask=mask if photo.mask is None else mask & photo.mask)
+        return photo if self._mode == "off" else _masked(photo, self.masks[view.index])
 
     def shares(self) -> dict[str, float]:
         """The masked share of the photo, by the name of each view in which something moves."""
@@ -223,52 +217,73 @@ class Transients(Part):
             self._note()
 
 
+class KnownTransients(Part):
+    """Masks what moves in the photos of a scene that is already trained."""
+
+    name = "known_transients"
+
+    def begin(self, run: Run) -> None:
+        """Compute the masks with the first Gaussians.
+
+        Raises: UserError: a photo is missing or damaged.
+        """
+        shown = renderings(
+            run.gaussians,
+            run.dataset.train,
+            run.photos,
+            run.background.evaluation,
+            sh_degree=run.gaussians.sh_degree,
+            render=sharded_render(run.shards, with_depth=True),
+        )
+        maps = [cell_map(each) for each in shown]
+        nothing = [torch.zeros_like(cells.usable) for cells in maps]
+        self._masks = [~cells.cpu() for cells in _moving_cells(maps, nothing, "on")]
+
+    def target(self, run: Run, view: BatchView, photo: LoadedImage) -> LoadedImage:
+        """The photo with the mask of the user and that of what moves."""
+        return _masked(photo, self._masks[view.index])
+
+
+def _masked(photo: LoadedImage, cells: Tensor) -> LoadedImage:
+    """The photo, at any size, without the cells, (h, w) bool on the CPU, that are False."""
+    if bool(cells.all()):
+        return photo
+    size = photo.planes.shape[1:]
+    cells = cells.to(photo.planes.device, non_blocking=True)
+    mask = interpolate(cells[None, None].to(torch.uint8), size)[0, 0].to(torch.bool)
+    return replace(photo, mask=mask if photo.mask is None else mask & photo.mask)
+
+
 def _moving_cells(
     maps: Sequence[CellMap], before: Sequence[Tensor], mode: AutoOnOff
 ) -> list[Tensor]:
     """The cells (h, w) bool of each map in which something moves; ``before``: of the last time."""
-    large = large_residual([cells.residual for cells in maps])
 
-    def found(ignored: Sequence[Tensor], large: float, alone: bool) -> list[Tensor]:
-        return [
-            cells_that_move(cells, *elsewhere, large, last, alone)
-            for cells, elsewhere, last in zip(
-                maps, residuals_elsewhere(maps, ignored), before, strict=True
-            )
-        ]
+    def found(ignored: Sequence[Tensor]) -> list[Tensor]:
+        said = witnesses(maps, ignored)
+        return [cells_that_move(*each) for each in zip(maps, said, strict=True)]
 
-    first = found(before, large, False)
+    first = found(before)
     if _significant(first):
-        return found(first, _LESS * large, True)
+        return found(first)
     return [torch.zeros_like(cells) for cells in first] if mode == "auto" else first
 
 
-def cells_that_move(
-    cells: CellMap, elsewhere: Tensor, others: Tensor, large: float, before: Tensor, alone: bool
-) -> Tensor:
-    """(h, w) bool: the cells in which something moves, and the cells around them.
+def cells_that_move(cells: CellMap, others: Witnesses) -> Tensor:
+    """(h, w) bool: the cells of a view in which something moves, and the cells around them.
 
-    Args:
-        cells: those of a view.
-        elsewhere: (h, w), the residual of their places in other views; see `residuals_elsewhere`.
-        others: (h, w), the number of these views.
-        large: the smallest large residual.
-        before: (h, w) bool, the result of the last time.
-        alone: whether places that one or no other view shows can be found, too.
+    ``others``: what the other photos say about these cells.
     """
-    large_here = cells.residual >= large
-    differs = cells.correlation < _SAME_DETAIL
-    judged = others >= (1 if alone else _FEWEST_OTHERS)
-    stands_out = judged & differs & (cells.residual >= _TIMES * elsewhere)
-    unknown = ~judged & differs & (cells.places.inverse_depth > 0.0) & large_here
-    confirmed = stands_out & large_here
-    likely = confirmed | unknown if alone else confirmed
-    found = likely & (_votes(likely) >= _VOTES)
-    # Other photos need not confirm the cells around, but must not contradict.
-    notable = (stands_out & (cells.residual >= _NOTABLE * large)) | unknown
-    found |= before & notable
-    for _ in range(_RINGS):
-        found |= _dilated(found) & notable
+    possible = (cells.residual >= _NOTABLE * cells.noise) & (cells.correlation < _SAME_DETAIL)
+    possible &= others.explained >= _MOST * others.others
+    contradicted = others.contradicting >= _MOST * others.comparable
+    contradicted &= possible & (others.contradicting >= _FEWEST_OTHERS)
+    found = contradicted & (_votes(contradicted) >= _VOTES)
+    for _ in range(sum(found.shape)):
+        more = found | (_dilated(found) & possible)
+        if torch.equal(more, found):
+            break
+        found = more
     return _dilated(found)  # the edge of a thing lies within a cell
 
 
@@ -282,16 +297,6 @@ def _votes(cells: Tensor) -> Tensor:
 
 def _dilated(cells: Tensor) -> Tensor:
     return max_pool2d(cells[None].float(), 3, stride=1, padding=1)[0] > 0.0
-
-
-def large_residual(residuals: Sequence[Tensor]) -> float:
-    """The smallest large residual, for the residuals of the cells of all views."""
-    every = torch.cat([residual.flatten() for residual in residuals]).cpu()
-
-    def quantile(share: float) -> float:
-        return float(every.kthvalue(round(share * (len(every) - 1)) + 1).values)
-
-    return max(_LARGE, min(times * quantile(share) for times, share in _TIMES_QUANTILE))
 
 
 def _significant(found: Sequence[Tensor]) -> bool:
