@@ -333,25 +333,6 @@ def test_a_static_scene_changes_no_bit(still):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("moving", "compared"), [(True, 4), (False, 2)])
-def test_if_nothing_moves_the_photos_are_not_compared_again(
-    busy, still, moving, compared, monkeypatch
-):
-    trainer = Trainer(busy if moving else still, CONFIG)
-    steps = [round(moment * CONFIG.iterations) for moment in MOMENTS]
-    part = trainer.part(Transients)
-    compute, found = part._compute, []
-
-    def recorded(run):
-        found.append(run.step)
-        compute(run)
-
-    monkeypatch.setattr(part, "_compute", recorded)
-    trainer.run(until=steps[-1] + 1)
-    assert found == steps[:compared]
-
-
-@pytest.mark.slow
 def test_the_mask_of_the_user_remains(trained):
     size = (HEIGHT, WIDTH)
 

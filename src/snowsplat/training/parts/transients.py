@@ -69,8 +69,6 @@ MOMENTS = (0.1, 0.2, 0.3, 0.4)
 _FEWEST_VIEWS = {"auto": 30, "on": 8, "off": 0}
 #: With "auto", and with fewer steps for each view, the comparisons would take too much of the time.
 _STEPS_PER_VIEW = 8
-#: With "auto", if nothing moves after this moment, the photos are not compared again.
-_NOTHING = MOMENTS[1]
 #: The residual must be at least this number of its standard deviations in the photo.
 _NOTABLE = 2.0
 #: This share of the photos that show a place must contradict, and at least this number. Gloss and
@@ -120,9 +118,6 @@ class Transients(Part):
         """
         moments = [run.schedule.step_of(moment) for moment in MOMENTS]
         if self._mode == "off" or not run.schedule.contains(run.step, moments):
-            return
-        late = run.step > run.schedule.step_of(_NOTHING)
-        if self._mode == "auto" and late and not self.shares():
             return
         self._compute(run)
         if run.step >= moments[-1]:

@@ -160,7 +160,8 @@ def witnesses(maps: Sequence[CellMap], ignored: Sequence[Tensor]) -> list[Witnes
 
     A cell contradicts that of another view if its colour differs significantly from all colours
     around the place there. So an error of depth or pose of a cell is none, nor is detail that a
-    photo resolves and another does not. The noise of such differences is that of the two photos.
+    photo resolves and another does not. The noise is that of such differences or that of the
+    residuals: where the scene is wrong, its depths are wrong, too, and compare other places.
 
     ``ignored``: (h, w) bool for each map, cells that do not count in other views; on the device of
     the maps.
@@ -171,7 +172,7 @@ def witnesses(maps: Sequence[CellMap], ignored: Sequence[Tensor]) -> list[Witnes
     for i in range(len(maps)):
         seen = cells.seen_by(i, cells.nearest(i)[::_EVERY])
         if bool(seen.comparable.any()):
-            noise[i] = _deviation(seen.beyond[seen.comparable])
+            noise[i] = max(maps[i].noise, _deviation(seen.beyond[seen.comparable]))
     noise = noise.to(device)
     found = []
     for i, own in enumerate(maps):
