@@ -48,6 +48,18 @@ def test_compare_clamps_and_agrees_with_the_reference():
     assert metrics.name == "a"
 
 
+def test_a_mask_does_not_raise_the_ssim():
+    """The SSIM of a photo of which most is masked is that of the rest, but for its border."""
+    generator = torch.Generator().manual_seed(0)
+    image, target = torch.rand(2, 160, 160, 3, generator=generator)
+    mask = torch.zeros(160, 160, dtype=torch.bool)
+    mask[40:120, 40:120] = True
+    whole, part = compare(image, target), compare(image, target, mask)
+    assert part.ssim == pytest.approx(whole.ssim, abs=0.06)
+    assert compare(target, target, mask).ssim == pytest.approx(1.0, abs=1e-6)
+    assert compare(image, target, torch.ones_like(mask)).ssim == pytest.approx(whole.ssim)
+
+
 def test_masked_pixels_are_ignored():
     target = planar(20, 20, 2)
     image = target.clone()

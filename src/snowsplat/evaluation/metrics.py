@@ -3,8 +3,9 @@
 The rendered image is clamped to 0..1, as for a screen or a file, but it is not rounded to 8 bits.
 (The script `metrics.py` of the reference implementation reads rendered images from PNG files, where
 they are rounded. At 30 dB this costs less than 0.01 dB.) Transparent photos are composited over
-the background colour. If a view has a mask, PSNR ignores the masked pixels. SSIM and LPIPS treat
-them as equal in both images.
+the background colour. If a view has a mask, the masked pixels are ignored. For SSIM and LPIPS, they
+are equal in both images, and what differs is divided by the area of the other pixels: otherwise, a
+photo that is mostly masked would have an SSIM near 1, whatever the image is.
 
 The colour-aligned PSNR is measured after a gain and an offset of each channel of the image were
 fitted to the photo, see `color_alignment`. Thus it does not count that the photo has another
@@ -181,12 +182,18 @@ def compare(
     aligned = color_aligned(image, target, mask)
     if mask is not None:
         image = torch.where(mask[:, :, None], image, target)
+    ssim = float(ops.ssim(image, target))
+    distance = None if lpips is None else lpips(image, target)
+    if mask is not None:
+        parts = mask.numel() / max(1, int(mask.sum()))  # areas of the size of the unmasked one
+        ssim = 1.0 - parts * (1.0 - ssim)
+        distance = None if distance is None else parts * distance
     return ViewMetrics(
         name=name,
         psnr=psnr(image, target, mask),
-        ssim=float(ops.ssim(image, target)),
+        ssim=ssim,
         psnr_aligned=psnr(aligned, target, mask),
-        lpips=None if lpips is None else lpips(image, target),
+        lpips=distance,
         size=(image.shape[1], image.shape[0]),
         explained=_explained(aligned, target, mask),
     )
