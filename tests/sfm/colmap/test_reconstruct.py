@@ -86,3 +86,35 @@ def test_the_focal_length_in_exif_is_held_if_the_lens_contradicts_it(
     job.attempts = [attempt(9, 0.95, doubts=doubts)]
     job.lens = Lens(exif=exif)
     assert job._contradicts_exif() == tried
+
+
+@pytest.mark.parametrize(
+    ("agreement", "registered", "way"),
+    [
+        (0.99, 9, "own"),
+        (0.80, 9, "separate"),  # a zoom in a clip, explained by an impossible walk
+        (0.99, 5, "separate"),
+    ],
+)
+def test_focal_lengths_of_a_bent_model_are_found_with_separate_cameras(
+    job, monkeypatch, agreement, registered, way
+):
+    """Bundle adjustment of a bent model remains in it."""
+    found = []
+    groups = {
+        "may_differ": lambda photos: True,
+        "separate": lambda photos: photos,
+        "focals_of": lambda model: "separate",
+        "own_focals": lambda model, threads: "own",
+        "group_by_zoom": lambda photos, focals: found.append(focals),
+    }
+    for name, function in groups.items():
+        monkeypatch.setattr(reconstruct.camera_groups, name, function)
+    monkeypatch.setattr(reconstruct, "set_cameras", lambda *about: None)
+    mapping = SimpleNamespace(run=lambda mapper: ["a model"])
+    monkeypatch.setattr(job.runner, "mapping", lambda matched, lens: mapping)
+    job.matched, job.lens = SimpleNamespace(database=None), Lens()
+    job.attempts = [attempt(registered, agreement)]
+    job.attempts[0].models = ["a model"]
+    job._try_zooms()
+    assert found == [way]
