@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from itertools import pairwise
 from pathlib import Path
 
@@ -184,6 +185,8 @@ def test_progress_counts_files(tmp_path, make_scene):
 
 def test_levels_are_replaced_and_other_files_stay(tmp_path, make_scene, monkeypatch):
     (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "levels_9").mkdir()
+    (tmp_path / "levels_9/mine.txt").touch()
     path = tmp_path / INDEX
     write(path, make_scene(COUNT, 0))
     before = {file: file.read_bytes() for file in lod_files(path)}
@@ -193,7 +196,12 @@ def test_levels_are_replaced_and_other_files_stay(tmp_path, make_scene, monkeypa
             write(path, make_scene(300, 0))
     assert {file: file.read_bytes() for file in lod_files(path)} == before
     assert write(path, make_scene(300, 0)).counts()[0] == 300
-    assert {file.name for file in tmp_path.iterdir()} == {INDEX, "levels_2", "notes.txt"}
+    others = {"notes.txt", "levels_9"}
+    assert {file.name for file in tmp_path.iterdir()} == {INDEX, "levels_2", *others}
+    # The process was killed before it wrote the index.
+    shutil.copytree(tmp_path / "levels_2", tmp_path / "levels")
+    write(path, make_scene(200, 0))
+    assert {file.name for file in tmp_path.iterdir()} == {INDEX, "levels_3", *others}
 
 
 def _full_disk():

@@ -27,7 +27,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.gaussian_arrays import GaussianArrays
-from snowsplat.formats.lod import INDEX, read_index
+from snowsplat.formats.lod import INDEX
 from snowsplat.formats.sog import encode_sog
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import new_entries, write_bytes, write_text
@@ -40,6 +40,7 @@ _SAMPLE = 4096  # Gaussians from which the shape of a box is estimated
 _LARGEST = 80.0  # logarithm of a scale; a larger one is not finite in the browser
 _FOLDER = "levels"
 _FOLDERS = re.compile(rf"{_FOLDER}(_\d+)?")
+_MEMBER = re.compile(r"\d+_\d+")
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,8 @@ def write_lod(
 ) -> None:
     """Write `lod-meta.json` and, in a folder beside it, the levels.
 
-    The index is written last, so an interrupted call changes nothing. The levels of an index that
-    is replaced are removed. The folder of the index is created if it is missing.
+    The index is written last, so an interrupted call changes nothing. Earlier levels there are
+    removed. The folder of the index is created if it is missing.
 
     ``report``: called with the number of finished files, of all files, and the word "files".
 
@@ -86,7 +87,7 @@ def write_lod(
     tree = _Node.around(packable.means, np.arange(len(packable.means)), sizes.leaf)
     leaves = list(tree.leaves())
     path.parent.mkdir(parents=True, exist_ok=True)
-    before = _level_folders(path)
+    before = _level_folders(path.parent)
     folder = _free_name(path.parent)
     with new_entries(path.parent, [folder.name]) as new:
         (new / folder.name).mkdir()
@@ -107,14 +108,10 @@ def write_lod(
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _level_folders(path: Path) -> set[Path]:
-    """The folders of an existing index that `write_lod` has written."""
-    try:
-        files = read_index(path).files
-    except UserError:  # missing, or not one of ours
-        return set()
-    names = {file.relative_to(path.parent).parts[0] for file in files}
-    return {path.parent / name for name in names if _FOLDERS.fullmatch(name)}
+def _level_folders(parent: Path) -> list[Path]:
+    """The folders that `write_lod` has written, also those of a process that was killed then."""
+    found = [each for each in parent.iterdir() if _FOLDERS.fullmatch(each.name) and each.is_dir()]
+    return [each for each in found if all(_MEMBER.fullmatch(file.name) for file in each.iterdir())]
 
 
 def _free_name(parent: Path) -> Path:

@@ -150,6 +150,16 @@ def test_websockets(server):
         assert clients.status(answer) == status
 
 
+@pytest.mark.parametrize("method", ["GET", "POST", "PUT", "DELETE", "HEAD", "OPTIONS"])
+@pytest.mark.parametrize("more", ["X: y", f"X: {'y' * 9000}"], ids=["short", "long"])
+def test_an_upgrade_that_is_no_websocket_is_answered(server, method, more):
+    """The parser of WebSockets refuses other methods and longer lines; it was never answered."""
+    begin = f"{method} {clients.path(server.url)}echo HTTP/1.1"
+    lines = [begin, "Host: localhost", "Upgrade: websocket", "Connection: Upgrade", more, "", ""]
+    answer = clients.ask(server.url, "\r\n".join(lines).encode())
+    assert clients.status(answer) in (400, 426, 431)
+
+
 def test_the_number_of_websockets_is_limited(server, monkeypatch):
     monkeypatch.setattr(guard, "_WEBSOCKETS", 2)
     with websocket(server, "echo"), websocket(server, "echo"):

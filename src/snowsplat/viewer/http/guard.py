@@ -319,14 +319,15 @@ class HttpConnection(_SendLimit, H11Protocol):
             values.setdefault(name.lower(), []).append(value.strip())
         if any(len(values.get(name, [])) > 1 for name in (b"host", b"origin", b"content-length")):
             return HTTPStatus.BAD_REQUEST
-        # uvicorn would log requests for other protocols.
-        if values.get(b"upgrade", [b"websocket"]) != [b"websocket"]:
+        method = line.split(b" ")[0]
+        # uvicorn would log requests for other protocols, and never answer those by other methods.
+        if b"upgrade" in values and (method, values[b"upgrade"]) != (b"GET", [b"websocket"]):
             return HTTPStatus.BAD_REQUEST
         length = values.get(b"content-length", [b"0"])[0]
         # Without a declared size, a body has no limit.
         if b"transfer-encoding" in values or not re.fullmatch(rb"\d{1,18}", length):
             return HTTPStatus.BAD_REQUEST
-        if int(length) and line.split(b" ")[0] not in (b"POST", b"PUT"):
+        if int(length) and method not in (b"POST", b"PUT"):
             return HTTPStatus.BAD_REQUEST
         if int(length) > _BODY_SIZE:
             return HTTPStatus.REQUEST_ENTITY_TOO_LARGE
@@ -371,6 +372,10 @@ class WebSocketConnection(_SendLimit, WebSocketsSansIOProtocol):
             if self.transport.is_closing():
                 return
             super().data_received(data[start : start + _PIECE])
+            # What its parser answers to a line that is too long, such as a cookie, is not sent.
+            if self.conn.handshake_exc is not None and not self.handshake_initiated:
+                self.transport.write(b"".join(self.conn.data_to_send()))
+                self.transport.close()
 
     def _counted(self) -> list[Any]:
         """The new events; none if a page could not send them at this rate."""
