@@ -16,7 +16,7 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.data import load_dataset
-from snowsplat.data.dataset import Dataset
+from snowsplat.data.dataset import Dataset, Points
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.ops.splats import COLORS, Splats2D
@@ -28,6 +28,7 @@ from snowsplat.scene.render import project
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts import exposure_start as module
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.parts.exposure_start import (
     GAMMA,
@@ -132,6 +133,37 @@ def test_the_exposures_of_a_dataset(clean, degraded, gains):
     assert np.abs(after.log_gains.numpy() - gains).max() < 0.05
 
 
+@pytest.mark.parametrize(("known", "enough"), [(25, True), (15, False)])
+def test_photos_that_show_few_points_do_not_hide_the_exposures_of_others(
+    known, enough, monkeypatch
+):
+    """Of 60 photos, 35 or 45 show none of the points; 20 points are compared for each photo."""
+    generator = torch.Generator().manual_seed(2)
+    xyz = torch.rand(5000, 3, generator=generator)
+    true = 0.2 * torch.randn(known, 3, generator=generator, dtype=torch.float64)
+    steps = []
+
+    def log_colors(views, points, step, images):
+        steps.append(step)
+        logs = torch.full((60, len(points[::step]), 3), torch.nan, dtype=torch.float64)
+        logs[:known] = -1.0 + true[:, None]
+        logs[:known] += 0.02 * torch.randn(logs[:known].shape, generator=generator)
+        return logs
+
+    monkeypatch.setattr(module, "_log_colors", log_colors)
+    views = [SimpleNamespace(image=SimpleNamespace(path=Path("no photo")))] * 60
+    dataset = SimpleNamespace(train=views, points=Points(xyz, torch.zeros(5000, 3)))
+    monkeypatch.setattr(module, "exif_exposure", lambda path: None)
+    start = exposure_start(dataset, None)
+    assert steps == [5]
+    assert (start.spread is not None) == enough
+    if enough:
+        assert start.everywhere
+        expected = true - true.mean(0)
+        assert (start.log_gains[:known] - expected).abs().max() < 0.02
+        assert not start.log_gains[known:].any()
+
+
 def test_exif_data_are_used_without_points(degraded, tmp_path):
     views = []
     for i, view in enumerate(degraded.train):
@@ -210,7 +242,7 @@ def test_a_training_without_gains_is_told_that_exposures_differ(clean, degraded,
         notes.clear()
         options = TrainOptions(settings={"iterations": 1, "init": "points", **settings})
         train(folder, tmp_path / "out", options, overwrite=True, observer=observer)
-        return any("exposure=auto learns one gain for each photo" in note for note in notes)
+        return any("no gains are learnt, because exposure is off" in note for note in notes)
 
     assert told(clean.with_name("degraded"))
     assert not told(clean.with_name("degraded"), exposure="off")

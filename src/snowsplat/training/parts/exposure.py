@@ -224,7 +224,7 @@ def exposure_hint(run: Run) -> Message | None:
     if not _differ(start):
         return None
     return message(
-        "exposure: {found}; exposure=auto learns one gain for each photo and channel",
+        "exposure: {found}; no gains are learnt, because exposure is off: use exposure=auto",
         found=_found(start),
     )
 
@@ -236,7 +236,7 @@ def _differ(start: ExposureStart) -> bool:
 
 def _found(start: ExposureStart) -> Message:
     if start.spread is None:
-        return message("not known, because there are neither points nor EXIF data")
+        return message("not known from the points of the dataset or EXIF data")
     found = message(
         "photos differ by {spread:.2f} EV (standard deviation, from {source})",
         spread=start.spread,

@@ -38,8 +38,9 @@ from snowsplat.util.process import single_threaded
 
 #: Photos are encoded approximately by this power: value = light^(1 / 2.2).
 GAMMA = 2.2
-#: Number of points whose colours are compared.
-_SAMPLE = 1000
+#: The colours of at least this number of points are compared, and of this number for each photo, as
+#: a photo shows few of the points of a large scene; but there are at most so many colours in all.
+_SAMPLE, _SAMPLE_OF_PHOTO, _MOST_COLORS = 1000, 20, 2_000_000
 #: The photos are reduced by 4 or 2, to a longer side of at least this number of pixels.
 _SIDE = 200
 #: Darker values are noise, and brighter ones may be clipped.
@@ -53,8 +54,9 @@ _FIRST_SCALE, _SCALE = 1.0, 0.15
 _ITERATIONS = 12
 #: A photo needs observations of this total weight.
 _LEAST_WEIGHT = 20.0
-#: This share of the photos needs enough observations.
-_LEAST_SHARE = 0.7
+#: The exposures are known if this share of the photos has enough observations, or this number:
+#: then those of the others are assumed to be the mean.
+_LEAST_SHARE, _ENOUGH = 0.7, 20
 #: The colours of the other half must differ by at most this factor of before. In photos with fixed
 #: exposure, the factor is 0.98 to 1.03; in photos with automatic exposure, 0.4 to 0.85.
 _MORE_ALIKE = 0.9
@@ -93,14 +95,15 @@ def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
     views = dataset.train
     if dataset.points is not None and len(views) > 1:
         xyz = dataset.points.xyz.cpu()
-        step = -(-len(xyz) // _SAMPLE)
+        most = min(_SAMPLE_OF_PHOTO * len(views), _MOST_COLORS // len(views))
+        step = -(-len(xyz) // max(_SAMPLE, most))
         logs, half = _log_colors(views, xyz, step, images), _half(xyz[::step])
         half = half.to(logs.device)
         whole, one, other = log_gains(logs), log_gains(logs[:, half]), log_gains(logs[:, ~half])
         products = one * other
-        if products.isfinite().float().mean() > _LEAST_SHARE:
+        if int(products.isfinite().sum()) > 3 * min(_LEAST_SHARE * len(views), _ENOUGH):
             spread = GAMMA / math.log(2.0) * math.sqrt(max(0.0, float(products.nanmean())))
-            gains = whole.nan_to_num().to("cpu", torch.float32)
+            gains = (whole - whole.nanmean(0)).nan_to_num().to("cpu", torch.float32)
             everywhere = same_everywhere(logs, half, one, other)
             return ExposureStart(gains, spread, message("points"), everywhere)
     values = [exif_exposure(view.image.path) for view in views]
