@@ -14,6 +14,13 @@ class Clock:
 
     now = used = 100.0
 
+    def __init__(self) -> None:
+        self.called: list[object] = []
+
+    def call_later(self, seconds: float, measure: object) -> None:
+        self.called.append(measure)
+        self.sleep(seconds)
+
     def sleep(self, seconds: float) -> None:
         self.now += seconds
 
@@ -29,8 +36,7 @@ def clock(monkeypatch) -> Clock:
         monotonic=lambda: clock.now, thread_time=lambda: clock.used, sleep=clock.sleep
     )
     monkeypatch.setattr(time_limit, "time", fake)
-    loop = SimpleNamespace(call_later=lambda seconds, measure: clock.sleep(seconds))
-    monkeypatch.setattr(asyncio, "get_running_loop", lambda: loop)
+    monkeypatch.setattr(asyncio, "get_running_loop", lambda: clock)
     return clock
 
 
@@ -46,15 +52,23 @@ def test_a_busy_server_has_a_fifth_of_a_core_during_training(clock, training):
     assert share == pytest.approx(0.2 if training else 0.03 / 0.08, rel=0.03)
 
 
-def test_a_pause_is_at_most_a_second_and_work_for_the_training_is_not_counted(clock):
+def test_a_pause_is_at_most_a_second(clock):
     limit = ServerTimeLimit(lambda: True)
     limit.measure()
     clock.work(10.0)
     before = clock.now
     limit.measure()
     assert clock.now - before == pytest.approx(1.0 + time_limit._TICK)
-    with limit.uncounted():
-        clock.work(10.0)
-    before = clock.now
+    assert clock.called == [limit.measure] * 2
+
+
+def test_work_for_the_training_is_not_counted(clock):
+    limit = ServerTimeLimit(lambda: True)
     limit.measure()
-    assert clock.now - before == pytest.approx(time_limit._TICK)
+    before = clock.now
+    for _ in range(2):
+        with limit.uncounted():
+            clock.work(0.01)
+    clock.work(0.1)
+    limit.measure()
+    assert clock.now - before == pytest.approx(0.1 / 0.2)
