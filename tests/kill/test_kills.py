@@ -19,8 +19,10 @@ from .harness import (
     digest,
     make_jobs,
     names_in,
+    publish_jobs,
     sfm_jobs,
     some_gaussians,
+    studio_jobs,
     train_jobs,
 )
 
@@ -30,10 +32,23 @@ def killer(runner) -> Killer:
     return Killer(runner, seed=1)
 
 
-def test_convert(killer, tmp_path):
+@pytest.fixture
+def scenes(tmp_path) -> tuple[Path, Path]:
     write_gaussians(tmp_path / "in.ply", some_gaussians(2000, 1))
     write_gaussians(tmp_path / "other.ply", some_gaussians(100, 2))
-    assert not killer.kill(convert_jobs(tmp_path / "in.ply", tmp_path / "other.ply"), 4)
+    return tmp_path / "in.ply", tmp_path / "other.ply"
+
+
+def test_convert(killer, scenes):
+    assert not killer.kill(convert_jobs(*scenes), 4)
+
+
+def test_publish(killer, scenes):
+    assert not killer.kill(publish_jobs(*scenes), 3)
+
+
+def test_studio(killer, scenes):
+    assert not killer.kill(studio_jobs(scenes[0])[:2], 3)
 
 
 def test_train(killer, dataset):

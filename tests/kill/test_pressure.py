@@ -135,6 +135,20 @@ def test_a_full_disk(subcommand, runner, place, trained, dataset, photos):
         assert not changed, f"{subcommand} changed {changed}"
 
 
+def test_a_full_disk_keeps_the_old_site(runner, place, trained):
+    site = place / "site"
+    with full(place, 8000):
+        assert runner.run(["publish", trained, "-o", site]).code == 0
+        fill(place)
+        before = {name: digest(place / name) for name in names_in(place)}
+        refused(
+            runner.run(["publish", trained, "-o", site, "--overwrite", "--title", "New"]),
+            rf"{site}\S*: No space left on device",
+        )
+        assert not leftovers(place)
+        assert {name: digest(place / name) for name in names_in(place)} == before
+
+
 def test_a_disk_that_becomes_full_during_training(runner, place, dataset):
     """The last checkpoint stays valid. With free space, the resumed run produces the same scene."""
     out = place / "out"

@@ -33,7 +33,7 @@ from snowsplat.formats.gltf import place_in_scene
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import new_entries
 
 logger = logging.getLogger(__name__)
 
@@ -235,19 +235,12 @@ def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
             reach = _RADIUS * scales.max(1, keepdims=True)
             corners = np.stack([(means - reach).min(0), (means + reach).max(0)])
             splats.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners.astype(np.float32)))
-        with atomic_path(path) as temporary:
+        with new_entries(path.parent, [path.name]) as new:
             # OpenUSD selects the kind of a file by its suffix.
-            inner = temporary.with_name(f"{temporary.name}{'.usdc' if kind == '.usdz' else kind}")
-            package = temporary.with_name(f"{temporary.name}.usdz")
-            try:
-                layer.Export(str(inner))
-                if kind == ".usdz":
-                    asset = Sdf.AssetPath(str(inner))
-                    UsdUtils.CreateNewUsdzPackage(asset, str(package), "scene.usdc")
-                    inner.unlink()
-                    inner = package
-                inner.replace(temporary)
-            finally:
-                for file in (inner, package):
-                    file.unlink(missing_ok=True)
+            made, inner = new / f"made{kind}", new / f"made{kind.replace('z', 'c')}"
+            layer.Export(str(inner))
+            if kind == ".usdz":
+                asset = Sdf.AssetPath(str(inner))
+                UsdUtils.CreateNewUsdzPackage(asset, str(made), "scene.usdc")
+            made.replace(new / path.name)
     cut.report(".ply keeps them")

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from snowsplat.data import Dataset
-from snowsplat.formats.origin_file import Place, read_place, write_place
+from snowsplat.formats.origin_file import read_place, write_place
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import seen_from_dataset
@@ -22,7 +22,7 @@ from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import SettingError
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import new_entries
 
 # Steps of the distillation. See docs/what-was-tried.md.
 _STEPS = 60
@@ -82,28 +82,23 @@ def write_within(
     Raises: SettingError: even one Gaussian needs more.
     """
     count = len(scene)
-    with atomic_path(target) as temporary:
-        # The suffix selects the format.
-        path = temporary.with_name(temporary.name + target.name)
-        try:
-            # Fitting may change the size a little, and it takes longer than merging.
-            for fit in (False, True):
-                while count:
-                    smaller = decimation.merged(scene, count)
-                    write(path, decimation.fitted(smaller, scene) if fit else smaller)
-                    actual = path.stat().st_size
-                    if actual <= size:
-                        break
-                    count = int(count * min(0.98, size / actual))
-            if not count:
-                raise SettingError(
-                    "decimate", "no scene fits into {size}; use more", size=format_bytes(size)
-                )
-            path.replace(temporary)
-            write_place(target, read_place(path))
-        finally:
-            path.unlink(missing_ok=True)
-            write_place(path, Place())
+    with new_entries(target.parent, [target.name]) as new:
+        path = new / target.name
+        # Fitting may change the size a little, and it takes longer than merging.
+        for fit in (False, True):
+            while count:
+                smaller = decimation.merged(scene, count)
+                write(path, decimation.fitted(smaller, scene) if fit else smaller)
+                actual = path.stat().st_size
+                if actual <= size:
+                    break
+                count = int(count * min(0.98, size / actual))
+        if not count:
+            raise SettingError(
+                "decimate", "no scene fits into {size}; use more", size=format_bytes(size)
+            )
+        place = read_place(path)
+    write_place(target, place)
 
 
 def refine(

@@ -28,7 +28,7 @@ from snowsplat.studio.hand_on import export_file, is_exported
 from snowsplat.studio.job import is_being_made
 from snowsplat.studio.library import safe_title
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path, write_json
+from snowsplat.util.files import new_entries, write_json
 from snowsplat.util.safe_json import from_json, is_file, read_json
 from snowsplat.util.settings import Settings
 
@@ -76,9 +76,8 @@ def export(scene: StudioScene, settings: Export) -> dict[str, Any]:
             show_scene(scene)  # removes the other files
         target.parent.mkdir(exist_ok=True)
         if kind == "zip":
-            with atomic_path(target) as temporary:
-                archive = shutil.make_archive(str(temporary), "zip", scene.site)
-                os.replace(archive, temporary)
+            with new_entries(target.parent, [target.name]) as new:
+                shutil.make_archive(str(new / target.stem), "zip", scene.site)
         else:
             convert(file, target, overwrite=True)
         os.utime(target, ns=(time, time))
