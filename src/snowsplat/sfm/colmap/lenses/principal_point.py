@@ -107,9 +107,10 @@ def _covariances(
     model: pycolmap.Reconstruction,
     numbers: Sequence[int],
     adjuster: pycolmap.CeresBundleAdjuster,
-    summary: pycolmap.CeresBundleAdjustmentSummary,
+    summary: pycolmap.BundleAdjustmentSummary,
 ) -> list[Floats] | None:
     """(2, 2) of the principal point of each camera in pixels²; None: they are undetermined."""
+    assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)  # of a Ceres adjuster
     ceres = summary.ceres_summary
     freedom = ceres.num_residuals_reduced - ceres.num_effective_parameters_reduced
     if not summary.is_solution_usable() or freedom <= 0:
