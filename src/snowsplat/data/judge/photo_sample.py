@@ -20,10 +20,10 @@ SIDE = 320
 # name, and the nearest one by pose. If the poses are right, these see the same things.
 _ANCHORS = 8
 # Views whose pose may be wrong that are added: those with the pose of another one, and those far
-# from the line between their neighbours by name; and the views around each of them.
+# from between their neighbours by name, in position or direction; and the views around each.
 _REPEATED, _ASTRAY, _AROUND = 4, 4, 2
 # How many times the distance between the neighbours the way over a view is, to be astray.
-_DETOUR = 4.0
+_DETOUR = 3.0
 
 
 @dataclass(frozen=True)
@@ -88,11 +88,16 @@ def _suspects(rig: Rig) -> list[int]:
     repeated = np.flatnonzero(often[which.reshape(-1)] > 1)[:_REPEATED]
     if count < 3:
         return repeated.tolist()
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    ends = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
-    detour = (steps[:-1] + steps[1:]) / np.maximum(ends, max(np.median(steps), 1e-30))
+    detour = np.maximum(_detours(positions), _detours(rig.rotation.reshape(count, 9)))
     astray = 1 + np.argsort(-detour, kind="stable")[:_ASTRAY]
     return [*repeated.tolist(), *(int(i) for i in astray if detour[i - 1] > _DETOUR)]
+
+
+def _detours(values: np.ndarray) -> np.ndarray:
+    """(N − 2,): how much longer the way over a row (N, D) is than that between its neighbours."""
+    steps = np.linalg.norm(np.diff(values, axis=0), axis=1)
+    ends = np.linalg.norm(values[2:] - values[:-2], axis=1)
+    return (steps[:-1] + steps[1:]) / np.maximum(ends, max(np.median(steps), 1e-30))
 
 
 def _photo(view: View) -> np.ndarray | None:
