@@ -250,8 +250,9 @@ def _open(path: Path) -> None:
     elif path.suffix == ".zip":
         with zipfile.ZipFile(path) as archive:
             assert archive.testzip() is None
-    elif path.suffix == ".html":
-        assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
+    elif path.suffix in (".html", ".svg"):
+        end = f"</{path.suffix[1:]}>"
+        assert path.read_text(encoding="utf-8").rstrip().endswith(end)
     elif name in ("input.ply", "points3D.ply"):
         for _ in open_table(path).rows():
             pass
@@ -356,6 +357,7 @@ class Killer:
         """The output folder and the result of an undisturbed run."""
         if job.name not in self._references:
             folder = self.runner.folder / f"whole {job.name}"
+            shutil.rmtree(folder, ignore_errors=True)  # of a try that failed
             folder.mkdir()
             job.prepare(folder / job.output)
             ended = self.runner.run(job.command(folder / job.output, False))
