@@ -209,16 +209,17 @@ def _are_placeholder(points: Points) -> bool:
 def _with_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
     """The same images, with ``depths/IMG.png`` and ``normals/IMG.png`` of the folder, or
     ``IMG.jpg.png``, or files of other formats, as maps of ``IMG.jpg``."""
-    for kind, maps in zip(("depth", "normals"), folders_of_maps(folder), strict=True):
-        if maps is None:
-            continue
-        found = [
-            replace(image, **{kind: getattr(image, kind) or _map_of(image, maps)})
-            for image in posed
-        ]
-        if not any(getattr(image, kind) for image in found):
+    depths, normals = folders_of_maps(folder)
+    if depths is not None:
+        posed = [replace(image, depth=image.depth or _map_of(image, depths)) for image in posed]
+    if normals is not None:
+        posed = [replace(image, normals=_map_of(image, normals)) for image in posed]
+    for maps, used in (
+        (depths, any(image.depth for image in posed)),
+        (normals, any(image.normals for image in posed)),
+    ):
+        if maps is not None and not used:
             logger.warning("%s: none of its files has the name of a photo; not used", maps)
-        posed = found
     return posed
 
 
