@@ -22,7 +22,9 @@ The thing that moves continues over the cells around with a notable residual and
 correlation, unless the other photos are not explained there either. A place that no other photo
 shows is never masked without such a beginning: what is not seen twice does not contradict.
 
-If something moves in several photos, the photos are compared again without it.
+If something moves in several photos, the photos are compared again without it, and the noise is
+only that of the differences between photos. One other photo is then enough if it agrees with the
+scene.
 
 The masks are computed anew at a few moments. A place that is masked by mistake is still trained by
 the other photos, so it is not masked the next time. As in RobustSplat (Fu et al. 2025), Gaussians
@@ -254,25 +256,28 @@ def _moving_cells(
 ) -> list[Tensor]:
     """The cells (h, w) bool of each map in which something moves; ``before``: of the last time."""
 
-    def found(ignored: Sequence[Tensor]) -> list[Tensor]:
-        said = witnesses(maps, ignored)
-        return [cells_that_move(*each) for each in zip(maps, said, strict=True)]
+    def found(ignored: Sequence[Tensor], certain: bool) -> list[Tensor]:
+        said = witnesses(maps, ignored, certain=certain)
+        fewest = _FEWEST_OTHERS if certain else 1
+        return [cells_that_move(*each, fewest) for each in zip(maps, said, strict=True)]
 
-    first = found(before)
+    first = found(before, True)
     if _significant(first):
-        return found(first)
+        return found(first, False)
     return [torch.zeros_like(cells) for cells in first] if mode == "auto" else first
 
 
-def cells_that_move(cells: CellMap, others: Witnesses) -> Tensor:
+def cells_that_move(cells: CellMap, others: Witnesses, fewest: int = _FEWEST_OTHERS) -> Tensor:
     """(h, w) bool: the cells of a view in which something moves, and the cells around them.
 
-    ``others``: what the other photos say about these cells.
+    Args:
+        others: what the other photos say about these cells.
+        fewest: the number of photos that must contradict.
     """
     possible = (cells.residual >= _NOTABLE * cells.noise) & (cells.correlation < _SAME_DETAIL)
     possible &= others.explained >= _MOST * others.others
     contradicted = others.contradicting >= _MOST * others.comparable
-    contradicted &= possible & (others.contradicting >= _FEWEST_OTHERS)
+    contradicted &= possible & (others.contradicting >= fewest)
     found = contradicted & (_votes(contradicted) >= _VOTES)
     for _ in range(sum(found.shape)):
         more = found | (_dilated(found) & possible)

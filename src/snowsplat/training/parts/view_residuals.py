@@ -155,16 +155,20 @@ def _deviation(differences: Tensor) -> float:
     return max(_LEAST_NOISE, found)
 
 
-def witnesses(maps: Sequence[CellMap], ignored: Sequence[Tensor]) -> list[Witnesses]:
+def witnesses(
+    maps: Sequence[CellMap], ignored: Sequence[Tensor], *, certain: bool = True
+) -> list[Witnesses]:
     """What the other photos say about each cell of each map.
 
     A cell contradicts that of another view if its colour differs significantly from all colours
     around the place there. So an error of depth or pose of a cell is none, nor is detail that a
-    photo resolves and another does not. The noise is that of such differences or that of the
-    residuals: where the scene is wrong, its depths are wrong, too, and compare other places.
+    photo resolves and another does not. The noise is that of such differences.
 
-    ``ignored``: (h, w) bool for each map, cells that do not count in other views; on the device of
-    the maps.
+    Args:
+        ignored: (h, w) bool for each map, cells that do not count in other views; on the device of
+            the maps.
+        certain: whether the noise is at least that of the residuals: where the scene is wrong, its
+            depths are wrong, too, and other places are compared.
     """
     cells = _AllCells(maps, ignored)
     device = maps[0].residual.device
@@ -172,7 +176,8 @@ def witnesses(maps: Sequence[CellMap], ignored: Sequence[Tensor]) -> list[Witnes
     for i in range(len(maps)):
         seen = cells.seen_by(i, cells.nearest(i)[::_EVERY])
         if bool(seen.comparable.any()):
-            noise[i] = max(maps[i].noise, _deviation(seen.beyond[seen.comparable]))
+            least = maps[i].noise if certain else 0.0
+            noise[i] = max(least, _deviation(seen.beyond[seen.comparable]))
     noise = noise.to(device)
     found = []
     for i, own in enumerate(maps):
