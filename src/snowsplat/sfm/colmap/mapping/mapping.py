@@ -35,6 +35,8 @@ _MIN_POINTS_ALIGNED = 10
 # At the end, observations with a larger reprojection error are removed. In pixels of the resized
 # photo in which the features were detected.
 _MAX_REPROJECTION_ERROR = 3.0
+# Principal points of models with fewer photos, often a part of all photos, are not estimated.
+_MIN_PHOTOS_FOR_CENTRE = 8
 _MAX_MODELS = 20  # a model is started at most this number of times
 # A model is small if it has fewer photos than this, and than this share of the photos that are in
 # no model (as COLMAP's min_model_size, and its condition for few photos).
@@ -158,7 +160,7 @@ class Mapping:
         """
         align_features(model, self.database, self.images, image_size, self.threads)
         self._refine(model, _MIN_POINTS_ALIGNED, tolerances=_ALIGNED_TOLERANCES)
-        if not self.held:
+        if not self.held and model.num_reg_images() >= _MIN_PHOTOS_FOR_CENTRE:
             model = refine_principal_points(model, self.threads)
             self._remove_outliers(model, _MIN_POINTS_ALIGNED)
         self._add_points(model)
