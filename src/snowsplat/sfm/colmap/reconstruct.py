@@ -88,7 +88,7 @@ class PoseEstimation:
         self.attempts: list[Attempt] = []
         # The matches of all photos, and the scores of attempts with these; None: they have changed.
         self.pairs: list[PairMatches] | None = None
-        self.scores: dict[int, Score] = {}  # by the identity of the attempt
+        self.scores: list[tuple[Attempt, Score]] = []
         self.log: list[str] = []  # a description of each attempt, as text for users
 
     @property
@@ -309,11 +309,13 @@ class PoseEstimation:
 
     def _score(self, attempt: Attempt) -> Score:
         if self.pairs is None:
-            self.pairs, self.scores = read_matches(self.matched.database), {}
-        if id(attempt) not in self.scores:
+            self.pairs, self.scores = read_matches(self.matched.database), []
+        known = next((score for other, score in self.scores if other is attempt), None)
+        if known is None:
             exif = {i: photo.focal for i, photo in enumerate(self.photos, 1) if photo.focal}
-            self.scores[id(attempt)] = score_of(attempt.models[0], self.pairs, exif)
-        return self.scores[id(attempt)]
+            known = score_of(attempt.models[0], self.pairs, exif)
+            self.scores.append((attempt, known))
+        return known
 
     def _describe_choice(self, best: Attempt) -> list[str]:
         """Which attempt was chosen, and how certain this is; empty if there was no choice."""

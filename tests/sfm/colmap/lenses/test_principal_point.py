@@ -76,6 +76,16 @@ def test_the_given_model_is_not_changed():
     assert (point_of(given) == CENTRE).all()
 
 
+def test_photos_without_a_pose_do_not_matter():
+    given = photographed(list(round_walk(13)), box_of_points())
+    pycolmap.ObservationManager(given).deregister_frame(given.image(7).frame_id)
+    given.update_point_3d_errors()
+    found = refine_principal_points(given, 1)
+    assert np.abs(point_of(found) - TRUE).max() < 0.5
+    assert found.num_reg_frames() == 12
+    assert not found.image(7).has_pose
+
+
 @pytest.mark.parametrize(("photos", "points", "noise"), [(4, 12, 1.0), (5, 15, 3.0)])
 def test_photos_that_hardly_determine_it_leave_it_near_the_centre(photos, points, noise):
     model = photographed(list(round_walk())[:photos], box_of_points(count=points), noise)

@@ -50,6 +50,11 @@ def refine_principal_points(
     if not numbers:
         return model
     made = copy.deepcopy(model)
+    # pycolmap computes covariances only if all frames have poses, also those that are not part of
+    # the model. Such a pose has no effect.
+    without = [frame for frame in made.frames.values() if not frame.has_pose()]
+    for frame in without:
+        frame.rig_from_world = pycolmap.Rigid3d()
     scale = model.compute_mean_reprojection_error()
     images = sorted(model.reg_image_ids())
     adjuster = _adjuster(made, images, scale, threads, free=True)
@@ -68,6 +73,8 @@ def refine_principal_points(
         sigma = SIGMA * max(camera.width, camera.height)
         params[rows] = combine_with_prior(params[rows], covariance, centre, sigma)
         camera.params = params
+    for frame in without:
+        frame.reset_pose()
     _adjuster(made, images, scale, threads, free=False).solve()
     made.update_point_3d_errors()
     return made
