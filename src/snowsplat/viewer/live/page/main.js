@@ -102,7 +102,8 @@ const connection = new Connection({
             about = message.lines;
             showAbout();
         } else if (type === "key") video.add(message.entry);
-        else if (type === "photo" && camera?.photo === message.index) byId("where").textContent = inLanguage(message.error);
+        else if (type === "photo" && camera?.photo === message.index)
+            byId("where").textContent = inLanguage(message.error);
     },
     image: async ({ number: arrived, view, blob }) => {
         newest = arrived;
