@@ -84,6 +84,7 @@ def test_the_reference_spelling_of_flags(run, dataset, tmp_path):
         "hold_out": 8,
         "first_held_out": 0,
         "test_list": None,
+        "left_out": None,
     }
     training = config["training"]
     assert training["background"] == "white"
@@ -385,9 +386,10 @@ def test_invalid_datasets_write_no_files(refused, dataset, tmp_path):
     assert photos[0].name in refused("train", damaged, "-o", out)
     shutil.rmtree(damaged)
     shutil.copytree(dataset, damaged)
-    # A valid header with truncated data: detected only when the photo is decoded.
-    content = (dataset / "images/view_03.png").read_bytes()
-    (damaged / "images/view_03.png").write_bytes(content[: len(content) // 2])
+    # Damaged in the middle: detected only when the photo is decoded.
+    content = bytearray((dataset / "images/view_03.png").read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    (damaged / "images/view_03.png").write_bytes(content)
     assert "view_03.png" in refused("train", damaged, "-o", out, *QUICK, "-q")
     assert not out.exists()
     model = damaged / "sparse/0/images.bin"

@@ -57,7 +57,9 @@ def test_a_damaged_held_out_photo_is_found_before_the_training(dataset, tmp_path
     """The training does not read it, so the error would come at the end."""
     shutil.copytree(dataset, tmp_path / "d")
     first = min((tmp_path / "d" / "images").iterdir())
-    first.write_bytes(first.read_bytes()[:-200])
+    content = bytearray(first.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    first.write_bytes(content)
     with pytest.raises(UserError, match=f"{first.name}: cannot be decoded"):
         train(tmp_path / "d", tmp_path / "out", options(5, hold_out=8))
     assert not (tmp_path / "out").exists()

@@ -44,17 +44,6 @@ def written(model: pycolmap.Reconstruction, folder) -> pycolmap.Reconstruction:
     return pycolmap.Reconstruction(folder / "sparse" / "0")
 
 
-def test_an_older_model_is_replaced_completely(found, tmp_path):
-    (tmp_path / "sparse" / "0").mkdir(parents=True)
-    (tmp_path / "sparse" / "1").mkdir()
-    (tmp_path / "sparse" / "0" / "images.txt").write_text("old")
-    written(found, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
-    names = {path.name for path in (tmp_path / "sparse").rglob("*")}
-    assert {"0", "cameras.bin", "images.bin", "points3D.bin", "points3D.ply"} <= names
-    assert not {"1", "images.txt"} & names
-
-
 def test_keypoints_without_an_undistorted_position_are_finite(found, tmp_path):
     camera = opencv(-0.9)  # the polynomial turns back inside the image
     corner = np.array([[1.0, 1.0]])

@@ -242,7 +242,15 @@ def test_the_number_of_threads_does_not_change_the_result(dataset, threads):
     assert steps == [(n, 6) for n in range(7)]
     assert torch.get_num_threads() == before
     once = [(dataset / "images" / name).read_bytes() for name in NAMES]
+    (dataset / "sparse" / "1").mkdir()
+    (dataset / "sparse" / "0" / "images.txt").write_text("old")
     undistort(dataset, PHOTOS, scene(), False, silent, 2)
+    assert {path.name for path in dataset.glob("sparse/**/*")} >= {
+        "0",
+        "cameras.bin",
+        "points3D.ply",
+    }
+    assert not [*dataset.glob("sparse/1"), *dataset.glob("sparse/0/*.txt")]
     assert once == [(dataset / "images" / name).read_bytes() for name in NAMES]
 
 
