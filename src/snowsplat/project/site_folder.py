@@ -4,7 +4,7 @@
     SITE/files-HASH/   scene.sog, or lod-meta.json with levels; poster.jpg, stops.webp; the viewer
 
 The name of the folder depends on its content. So whoever has loaded a page gets the files of this
-page, also from a cache, and a site is replaced by one file: `SiteFolder.new_files`.
+page, also from a cache, and a site is replaced by one file: `SiteFolder.replace`.
 """
 
 from __future__ import annotations

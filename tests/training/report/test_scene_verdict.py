@@ -134,6 +134,6 @@ def test_the_verdict_on_the_photos_counts_but_held_out_photos_outweigh_it(
     assert (reason.advice == message("move")) == (as_part_of != "good" or grade == "good")
 
 
-def test_few_held_out_photos_do_not_contradict_the_verdict_on_the_photos(dataset):
+def test_good_photos_do_not_make_a_scene_good_that_held_out_photos_contradict(dataset):
     nice = Verdict.of([Reason("good", message("50 photos"))])
     assert scene_verdict(evaluation(0.5), SHARP, dataset, capture=nice).grade == "poor"
