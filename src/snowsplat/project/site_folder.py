@@ -19,7 +19,7 @@ from pathlib import Path
 
 from snowsplat.project.inside import Inside
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import STAGE, is_temporary, new_folder, write_text
+from snowsplat.util.files import STAGE, is_temporary, new_folder, sync_entries, write_text
 
 PAGE, SCENE, POSTER = "index.html", "scene.sog", "poster.jpg"
 _NAME = "files-[0-9a-f]{12}"
@@ -77,6 +77,7 @@ class SiteFolder:
             made = stage / "files"
             made.mkdir()
             write(made)
+            sync_entries(made)
             digest = _digest(made)
             name = f"files-{digest}"
             new = self.path / name

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import itertools
 import json
 import os
 import re
@@ -79,8 +80,8 @@ def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
     _sync_folder(path.parent)
 
 
-def _check(path: Path) -> None:
-    for check in list(CHECKS):
+def _check(*paths: Path) -> None:
+    for check, path in itertools.product(list(CHECKS), paths):
         check(path.absolute())
 
 
@@ -178,30 +179,31 @@ def new_entries(folder: Path, names: Sequence[str]) -> Iterator[Path]:
         OSError: ``folder`` cannot be written, or the disk is full.
         UserError: one of `CHECKS` does not permit it.
     """
-    for name in names:
-        _check(folder / name)
+    targets = [folder / name for name in names]
+    _check(*targets)
     with new_folder(folder / STAGE) as new:
         yield new
-        for path in new.rglob("*") if os.name == "posix" else ():
-            if not path.is_symlink():
-                _sync(path)
-        for name in names:
-            _check(folder / name)
-        *others, last = names
-        if others:
-            _set_aside(folder / last, new)
-        for name in names:
-            made, target = new / name, folder / name
-            if not os.path.lexists(made):
-                _set_aside(target, new)
+        sync_entries(new)
+        _check(*targets)
+        if len(targets) > 1:
+            _set_aside(targets[-1], new)
+        for name, target in zip(names, targets, strict=True):
+            is_made = os.path.lexists(made := new / name)
+            if is_made and target.is_dir() and _exchanged(made, target):
                 continue
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if target.is_dir() and _exchanged(made, target):
-                continue
-            if target.is_dir() or made.is_dir():
+            if not is_made or target.is_dir() or made.is_dir():
                 _set_aside(target, new)
-            os.replace(made, target)
+            if is_made:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(made, target)
         _sync_folder(folder)
+
+
+def sync_entries(folder: Path) -> None:
+    """Make all files and folders in a folder durable."""
+    for path in folder.rglob("*") if os.name == "posix" else ():
+        if not path.is_symlink():
+            _sync(path)
 
 
 def _set_aside(path: Path, new: Path) -> None:
