@@ -9,7 +9,6 @@ import pytest
 from snowsplat.sfm.colmap.checks.score import (
     PairMatches,
     lens_prior,
-    likelihood,
     read_matches,
     score_of,
 )
@@ -147,14 +146,6 @@ def test_where_the_matches_say_nothing_the_lens_decides():
 def test_an_unusual_lens_costs(params, least):
     plain = camera(model="OPENCV")
     assert lens_prior(plain, None) - lens_prior(camera(model="OPENCV", params=params), None) > least
-
-
-def test_the_likelihood_of_one_match():
-    """By hand: a distance of 0 with σ at its least, and ε at its least."""
-    value, noise, false, count = likelihood(np.zeros(1), np.full(1, 1600.0))
-    assert (noise, false) == (0.5, 0.01)
-    assert value == pytest.approx(np.log(0.01 + 0.99 * np.sqrt(2 / np.pi) * 800 / 0.5))
-    assert count == pytest.approx(1, abs=1e-4)
 
 
 def test_a_walk_past_two_places_that_look_alike_is_not_folded(tmp_path):

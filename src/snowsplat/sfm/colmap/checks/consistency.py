@@ -27,8 +27,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.data.lens.models import lens_of
+from snowsplat.scene.epipolar import Floats, distances_of_matches
 from snowsplat.sfm.colmap.database import VerifiedPair, closing_database, verified_pairs
-from snowsplat.sfm.colmap.epipolar import Floats, distances_of_matches
 from snowsplat.sfm.colmap.features.extraction import SEED
 from snowsplat.sfm.colmap.lenses.lens import is_fisheye, pixels_per_radian
 from snowsplat.sfm.colmap.mapping.view_graph import database_names, following_pairs

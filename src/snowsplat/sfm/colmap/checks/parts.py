@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from snowsplat.scene.epipolar import Floats
 from snowsplat.sfm.colmap.checks.consistency import CheckedPair, Ints
-from snowsplat.sfm.colmap.epipolar import Floats
 from snowsplat.util.components import components
 
 # Two parts contradict each other if both of these conditions hold:

@@ -14,7 +14,7 @@ D, half of the longer side. The ratio of the densities is
     r(d) = √(2/π) (D / σ) exp(−d² / 2σ²).
 
 σ and the share ε of false matches are those that make the score of the model largest (expectation
-maximisation), with σ of at least `_LEAST_NOISE`. Matches of a photo without a pose may be of any
+maximisation), with σ of at least `LEAST_NOISE`. Matches of a photo without a pose may be of any
 kind: they add nothing. So a photo that is left out costs what its matches would have said, and one
 in a wrong place costs more: log ε for each match. All matches of a pair count: places that look
 alike have fewer than photos that were taken side by side.
@@ -36,11 +36,16 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
+from snowsplat.scene.epipolar import (
+    LEAST_FALSE,
+    LEAST_NOISE,
+    Floats,
+    distances_of_matches,
+    likelihood,
+)
 from snowsplat.sfm.colmap.checks.consistency import rays_of
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
-from snowsplat.sfm.colmap.epipolar import Floats, distances_of_matches
 from snowsplat.sfm.colmap.lenses.lens import (
     GUESSED_FISHEYE,
     GUESSED_FOCAL,
@@ -51,11 +56,6 @@ from snowsplat.sfm.colmap.lenses.lens import (
 )
 from snowsplat.sfm.colmap.lenses.principal_point import SIGMA
 
-# Pixels of a photo of this longer side. What bundle adjustment does not model (rolling shutter,
-# distortions of higher order) is no smaller in photos of people.
-_LEAST_NOISE, _OF_SIDE = 0.5, 1600
-_ROUNDS = 20  # of expectation maximisation
-_LEAST_FALSE, _MOST_FALSE = 0.01, 0.5  # bounds of ε
 # Standard deviations of the logarithm of a focal length: by EXIF, which rounds it to a millimetre,
 # and of all that people use: two thirds of photos are taken at 16 to 45 mm.
 _EXIF, _ANY_FOCAL = 0.05, 0.5
@@ -134,35 +134,9 @@ def score_of(
         known = [exif[i] for i in taken if i in exif]
         lenses += lens_prior(model.cameras[number], float(np.median(known)) if known else None)
     if not distances:
-        return Score(0.0, lenses, complexity, _LEAST_NOISE, _LEAST_FALSE, 0.0)
+        return Score(0.0, lenses, complexity, LEAST_NOISE, LEAST_FALSE, 0.0)
     value, noise, false, true = likelihood(np.concatenate(distances), np.concatenate(sides))
     return Score(value, lenses, complexity, noise, false, true / everything)
-
-
-def likelihood(distances: Floats, sides: Floats) -> tuple[float, float, float, float]:
-    """The logarithm of the likelihood, σ in pixels, ε, and the expected number of true matches.
-
-    Args:
-        distances: (M,) of the matches from their epipolar lines in pixels; may be infinite.
-        sides: (M,) the longer side of their photos in pixels.
-    """
-    least = _LEAST_NOISE * float(np.mean(sides)) / _OF_SIDE
-    noise, false = 4 * least, 0.1
-    squares = np.where(np.isfinite(distances), distances, 0.0) ** 2
-    for _ in range(_ROUNDS):
-        ratio = _ratio(distances, sides, noise)
-        true = (1 - false) * ratio / (false + (1 - false) * ratio)
-        count = float(true.sum())
-        noise = max(least, math.sqrt(float((true * squares).sum()) / max(count, 1e-9)))
-        false = min(_MOST_FALSE, max(_LEAST_FALSE, 1 - count / len(distances)))
-    ratio = _ratio(distances, sides, noise)
-    value = float(np.log(false + (1 - false) * ratio).sum())
-    return value, noise, false, count
-
-
-def _ratio(distances: Floats, sides: Floats, noise: float) -> NDArray[np.float64]:
-    density = np.exp(-0.5 * (distances / noise) ** 2)
-    return np.asarray(math.sqrt(2 / math.pi) * (sides / 2) / noise * density)
 
 
 def _distances(model: pycolmap.Reconstruction, pair: PairMatches) -> tuple[Floats, float]:

@@ -12,8 +12,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snowsplat.scene.epipolar import sampson_distances
 from snowsplat.sfm.colmap.database import closing_database
-from snowsplat.sfm.colmap.epipolar import sampson_distances
 from snowsplat.sfm.colmap.features.extraction import SEED, WorkerProgress
 from snowsplat.sfm.colmap.pairs.guided_matching import PhotoSide, match
 from snowsplat.sfm.colmap.pairs.matching import LENGTH

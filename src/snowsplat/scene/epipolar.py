@@ -1,7 +1,15 @@
-"""Epipolar geometry of matches: how far they are from what a relative pose says."""
+"""Epipolar geometry of matches: how far they are from what a relative pose says, and how probable
+that makes them (MLESAC, Torr and Zisserman 2000).
+
+d is the Sampson distance of a match from the epipolar line, in pixels; infinite if its rays meet
+behind a camera. A true match has a normal error of standard deviation σ across the line; a false
+one, or one of two photos whose poses are wrong, is anywhere within the distance D, half of the
+longer side. The ratio of the densities is r(d) = √(2/π) (D / σ) exp(−d² / 2σ²).
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -9,6 +17,11 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
 
+# Pixels of a photo of this longer side. What bundle adjustment does not model (rolling shutter,
+# distortions of higher order) is no smaller in photos of people.
+LEAST_NOISE, _OF_SIDE = 0.5, 1600
+LEAST_FALSE, _MOST_FALSE = 0.01, 0.5  # bounds of the share ε of false matches
+_ROUNDS = 20  # of expectation maximisation
 _MIN_ANGLE = 2.0  # degrees: two rays with a smaller angle between them count as parallel
 
 
@@ -59,3 +72,36 @@ def distances_of_matches(
     is_in_front = (cosine * along2 > along1) & (along2 > cosine * along1)
     is_parallel = cosine > np.cos(np.radians(_MIN_ANGLE))
     return np.where(is_in_front | is_parallel, distance, np.inf)
+
+
+def likelihood(distances: Floats, sides: Floats) -> tuple[float, float, float, float]:
+    """The logarithm of the likelihood, σ in pixels, ε, and the expected number of true matches.
+
+    Args:
+        distances: (M,) of the matches from their epipolar lines in pixels; may be infinite.
+        sides: (M,) the longer side of their photos in pixels.
+    """
+    least = LEAST_NOISE * float(np.mean(sides)) / _OF_SIDE
+    noise, false = 4 * least, 0.1
+    squares = np.where(np.isfinite(distances), distances, 0.0) ** 2
+    for _ in range(_ROUNDS):
+        ratio = _ratio(distances, sides, noise)
+        true = (1 - false) * ratio / (false + (1 - false) * ratio)
+        count = float(true.sum())
+        noise = max(least, math.sqrt(float((true * squares).sum()) / max(count, 1e-9)))
+        false = min(_MOST_FALSE, max(LEAST_FALSE, 1 - count / len(distances)))
+    value = float(log_odds(distances, sides, noise, false).sum())
+    return value, noise, false, count
+
+
+def log_odds(distances: Floats, sides: Floats, noise: float, false: float) -> Floats:
+    """(M,) log(ε + (1 − ε) r(d)): how much more probable matches are than if poses said nothing.
+
+    The arguments are those and results of `likelihood`.
+    """
+    return np.asarray(np.log(false + (1 - false) * _ratio(distances, sides, noise)))
+
+
+def _ratio(distances: Floats, sides: Floats, noise: float) -> Floats:
+    density = np.exp(-0.5 * (distances / noise) ** 2)
+    return np.asarray(math.sqrt(2 / math.pi) * (sides / 2) / noise * density)
