@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.formats import format_for_reading, read_arrays, read_gaussians, write_gaussians
+from snowsplat.formats import format_for_reading, read_arrays, read_gaussians, usd, write_gaussians
 from snowsplat.formats.usd import is_usd
+from snowsplat.util import limited_child
 from snowsplat.util.errors import UserError
 
 ORIGIN = (500_000.0, 20.0, -5_400_000.0)
@@ -24,6 +25,12 @@ try:
 except ImportError:
     installed = False
 with_usd = pytest.mark.skipif(not installed, reason="usd-core 26.3 or newer is not installed")
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only one test waits for child processes."""
+    monkeypatch.setattr(usd, "check_readable", lambda *_: None)
 
 
 def test_a_usd_file_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,3 +204,14 @@ def test_the_validators_of_openusd(make_scene, tmp_path: Path) -> None:
         assert [error.GetErrorAsString() for error in errors] == []
     (tmp_path / "b.usda").write_text('#usda 1.0\ndef Xform "a" {}\n')
     assert context.Validate(Usd.Stage.Open(str(tmp_path / "b.usda")))  # no unit, no default prim
+
+
+@with_usd
+def test_files_are_read_in_a_child_process_first(make_scene, tmp_path: Path, monkeypatch) -> None:
+    """OpenUSD takes 4 GB for a damaged file of 4 kB."""
+    write_gaussians(tmp_path / "a.usdc", make_scene(5, 1))
+    monkeypatch.setattr(usd, "check_readable", limited_child.check_readable)
+    assert len(read_arrays(tmp_path / "a.usdc").means) == 5
+    monkeypatch.setattr(limited_child, "_MEMORY", 1 << 22)
+    with pytest.raises(UserError, match=r"a.usdc: .*; copy or export it again"):
+        read_arrays(tmp_path / "a.usdc")

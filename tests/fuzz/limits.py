@@ -95,7 +95,8 @@ def _time_limit(seconds: float) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _address_limit() -> Iterator[None]:
+def address_limit(most: int = _ADDRESS_SPACE) -> Iterator[None]:
+    """Limit the address space of this process to ``most`` bytes more than now (on Linux)."""
     if sys.platform != "linux":
         yield
         return
@@ -103,7 +104,7 @@ def _address_limit() -> Iterator[None]:
 
     now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (now + _ADDRESS_SPACE, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (now + most, hard))
     try:
         yield
     finally:
@@ -173,7 +174,7 @@ def guarded(read: Callable[[], Any], home: Path, size: int, extra: int = 0) -> A
 
     _watch.home, _watch.found, _watch.thread = os.path.realpath(home), None, threading.get_ident()
     try:
-        with _time_limit(SECONDS), _address_limit():
+        with _time_limit(SECONDS), address_limit():
             result, used = measured(run)
     finally:
         _watch.home = None

@@ -29,13 +29,13 @@ from snowsplat.formats.spz_container import Header, pack
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.sfm import make_dataset
-from snowsplat.sfm.colmap.process import check_model
 from snowsplat.sfm.colmap.result import describe_model
 from snowsplat.sfm.ingest.photos import photo_files
 from snowsplat.sfm.ingest.video.clip import read_clip, why_no_video
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.history import History
+from snowsplat.util import limited_child
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Stages
 
@@ -430,7 +430,7 @@ def test_a_model_with_photos_outside(tmp_path, name):
 
 
 def test_a_model_for_which_colmap_would_allocate_all_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(check_model, "_MEMORY", 1 << 28)  # COLMAP fills it before it fails
+    monkeypatch.setattr(limited_child, "_MEMORY", 1 << 28)  # COLMAP fills it before it fails
     write_model_of(tmp_path, ["a.png", "b.png"])
     points = tmp_path / "distorted/sparse/0/points3D.bin"
     data = bytearray(points.read_bytes())

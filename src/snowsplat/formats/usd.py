@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from snowsplat.scene.length import stored_metres
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import new_entries
+from snowsplat.util.limited_child import check_readable
 
 logger = logging.getLogger(__name__)
 
@@ -41,10 +42,18 @@ _SUFFIXES = (".usdc", ".usda", ".usd")
 _PRIM = "/scene/splats"
 _OWN = "snowsplat"
 _SPACE = "colorSpace:name"
-# Gaussians in copies of point instancers, at most.
-_MOST_COPIED = 10_000_000
+_LIBRARIES = [f"pxr.{name}" for name in ("Sdf", "Tf", "UsdGeom", "UsdUtils", "UsdVol", "Vt")]
+# Gaussians with all copies by instances and point instancers, at most, or one per byte of the file.
+_MOST_REPEATED = 10_000_000
 # The radius of a Gaussian in its extent, in standard deviations.
 _RADIUS = 3.0
+
+
+class _Prim(NamedTuple):
+    splats: GaussianArrays  # in the frame of the prim
+    places: list[np.ndarray]  # (4, 4) scene with y up from prim, one for each copy
+    metres_per_unit: float | None  # of the stage
+    notes: list[str]  # how the prim is, if a user should know
 
 
 def is_usd(head: bytes) -> bool:
@@ -87,45 +96,61 @@ def read_usd(path: Path) -> GaussianArrays:
     Raises: UserError: usd-core is missing; the file cannot be read, is damaged, or has no splats.
     """
     path.open("rb").close()  # a clear error if that is not possible
-    with _usd(path) as (Usd, UsdGeom, _, UsdVol, _, _):
-        stage = Usd.Stage.Open(str(path))
-        # A stage whose unit is one metre says nothing: programs that do not know the unit write it.
-        unit = UsdGeom.GetStageMetersPerUnit(stage)
-        known = unit != 1.0 and UsdGeom.StageHasAuthoredMetersPerUnit(stage)
-        unit = stored_metres(unit) if known else None
-        own = stage.GetRootLayer().customLayerData.get(_OWN, {})
-        metres = stored_metres(own.get("metres_per_unit")) if isinstance(own, dict) else None
-        # In a stage with z up, z becomes y, and y becomes -z.
-        upright = np.eye(4)
-        if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
-            upright[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
-        time = Usd.TimeCode.EarliestTime()
-        places = UsdGeom.XformCache(time)
-        parts, notes = [], Counter[str]()
-        for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-            if not prim.IsA(UsdVol.ParticleField3DGaussianSplat):
-                continue
-            if UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
-                notes["invisible, left out"] += 1
-                continue
-            splats, matrices = _splats(prim, time), _placed(UsdGeom, places, prim, time)
-            if len(matrices) > 1 and len(matrices) * len(splats.means) > _MOST_COPIED:
-                raise Damaged("it repeats its splats too often")
-            parts += [place_in_scene(splats, upright @ matrix) for matrix in matrices]
-            if prim.GetAttribute("positions").ValueMightBeTimeVarying():
-                notes["animated; read at the first time"] += 1
-            space = next(filter(None, (p.GetAttribute(_SPACE).Get() for p in _upwards(prim))), "")
-            if space and not space.startswith("srgb"):
-                notes[f"in the colour space {space[:40]}; read as sRGB"] += 1
+    with _usd(path):
+        check_readable(prims_with_splats, path, _LIBRARIES)
+    prims = prims_with_splats(path)
+    notes = Counter(note for prim in prims for note in prim.notes)
     for note, count in notes.items():
         logger.warning("%s: %d prims with splats are %s", path, count, note)
+    parts = [place_in_scene(prim.splats, place) for prim in prims for place in prim.places]
     if not parts:
         raise Unsupported(
             "a USD file without visible Gaussian splats (ParticleField3DGaussianSplat)"
         )
     scene = GaussianArrays.cat(parts)
     found = usable_gaussians(path, *packing.flip_axes(replace(scene, means=scene.world_means())))
-    return replace(found, metres_per_unit=unit or metres)
+    return replace(found, metres_per_unit=prims[0].metres_per_unit)
+
+
+@reads
+def prims_with_splats(path: Path) -> list[_Prim]:
+    """The prims with splats in a file. Raises: as `read_usd`."""
+    with _usd(path) as (Usd, UsdGeom, _, UsdVol, _, _):
+        stage = Usd.Stage.Open(str(path))
+        # A stage whose unit is one metre says nothing: programs that do not know the unit write it.
+        unit = UsdGeom.GetStageMetersPerUnit(stage)
+        known = unit != 1.0 and UsdGeom.StageHasAuthoredMetersPerUnit(stage)
+        metres = stored_metres(unit) if known else None
+        own = stage.GetRootLayer().customLayerData.get(_OWN, {})
+        if metres is None and isinstance(own, dict):
+            metres = stored_metres(own.get("metres_per_unit"))
+        # In a stage with z up, z becomes y, and y becomes -z.
+        upright = np.eye(4)
+        if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
+            upright[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+        time = Usd.TimeCode.EarliestTime()
+        places = UsdGeom.XformCache(time)
+        found: list[_Prim] = []
+        most = max(_MOST_REPEATED, path.stat().st_size)
+        for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+            if not prim.IsA(UsdVol.ParticleField3DGaussianSplat):
+                continue
+            if UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+                found.append(_Prim(GaussianArrays.empty(), [], metres, ["invisible, left out"]))
+                continue
+            splats, matrices = _splats(prim, time), _placed(UsdGeom, places, prim, time)
+            most -= len(matrices) * len(splats.means)
+            if most < 0:
+                raise Damaged("it repeats its splats too often")
+            notes = []
+            if prim.GetAttribute("positions").ValueMightBeTimeVarying():
+                notes.append("animated; read at the first time")
+            space = next(filter(None, (p.GetAttribute(_SPACE).Get() for p in _upwards(prim))), "")
+            if space and not space.startswith("srgb"):
+                notes.append(f"in the colour space {space[:40]}; read as sRGB")
+            placed = [upright @ matrix for matrix in matrices]
+            found.append(_Prim(splats, placed, metres, notes))
+    return found
 
 
 def _upwards(prim: Any) -> Iterator[Any]:

@@ -11,9 +11,9 @@ import pycolmap
 
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.options import SfmResult
-from snowsplat.sfm.colmap.process.check_model import can_be_read
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.limited_child import check_readable
 from snowsplat.util.messages import message
 from snowsplat.util.safe_json import inside, quoted
 
@@ -82,10 +82,13 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
         raise _cannot_skip(f"there is no COLMAP model in {sparse / '0'}")
     models = []
     for folder in numbered:
-        if not can_be_read(folder):
-            raise _cannot_skip(f"the COLMAP model in {folder} is damaged or not supported")
-        models.append(pycolmap.Reconstruction(folder))
-        models[-1].update_point_3d_errors()
+        try:
+            check_readable(read_model, folder, ["pycolmap"])
+        except UserError:
+            raise _cannot_skip(
+                f"the COLMAP model in {folder} is damaged or not supported"
+            ) from None
+        models.append(read_model(folder))
     names = names_in(models[0])
     for name in names:
         # `undistort` uses these names as paths.
@@ -99,6 +102,18 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
     unregistered = {photo.name: missing for photo in photos if photo.name not in names}
     pairs = "not matched: the model existed already"
     return result_of(models, photos, unregistered=unregistered, pairs=pairs, attempts=[])
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """A model of COLMAP; everything that `result_of` uses of it has been computed once."""
+    model = pycolmap.Reconstruction(folder)
+    model.update_point_3d_errors()
+    model.compute_mean_reprojection_error()
+    for number in model.reg_image_ids():
+        camera = model.cameras[model.images[number].camera_id]
+        if not camera.is_spherical():  # a panorama has no such matrix
+            camera.calibration_matrix()
+    return model
 
 
 def _cannot_skip(reason: str) -> UserError:

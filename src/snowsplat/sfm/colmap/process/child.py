@@ -5,14 +5,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 import queue
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import MIN_PHOTOS, SfmOptions
 from snowsplat.sfm.progress import Figures, Report, ShowPoses
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.limited_child import child_environment
 from snowsplat.util.messages import as_message, message
 
 # Bytes by which the database may grow in one transaction.
@@ -198,20 +197,3 @@ def _communicate(
     with contextlib.suppress(BrokenPipeError):
         child.stdin.close()
     return answer
-
-
-def child_environment(threads: int) -> dict[str, str]:
-    """The environment of a child process that runs modules of this package.
-
-    COLMAP uses ``threads`` threads there.
-    """
-    # The child imports modules from the same places as this process (a checkout or an installed
-    # wheel), but not from the current folder.
-    paths: Sequence[str] = [os.path.abspath(path) for path in sys.path if path]
-    return {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(paths),
-        "PYTHONSAFEPATH": "1",
-        "OMP_NUM_THREADS": str(threads),
-        "OPENBLAS_NUM_THREADS": str(threads),
-    }

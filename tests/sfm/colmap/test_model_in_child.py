@@ -1,11 +1,14 @@
 """Models of unknown sources are read in a child process first."""
 
 import pycolmap
+import pytest
 import torch
 
-from snowsplat.sfm.colmap.process.check_model import can_be_read
+from snowsplat.sfm.colmap.result import read_model
+from snowsplat.util.errors import UserError
+from snowsplat.util.limited_child import check_readable
 
-from ...conftest import make_model
+from ..conftest import make_model
 
 
 def test_a_model_of_panoramas_can_be_read(tmp_path):
@@ -15,6 +18,7 @@ def test_a_model_of_panoramas_can_be_read(tmp_path):
         camera.model = pycolmap.CameraModelId.EQUIRECTANGULAR
         camera.params = [camera.width, camera.height]
     model.write(tmp_path)
-    assert can_be_read(tmp_path)
+    check_readable(read_model, tmp_path, ["pycolmap"])
     (tmp_path / "cameras.bin").write_bytes(b"no cameras")
-    assert not can_be_read(tmp_path)
+    with pytest.raises(UserError):
+        check_readable(read_model, tmp_path, ["pycolmap"])
