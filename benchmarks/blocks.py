@@ -25,9 +25,8 @@ import torch
 from PIL import Image
 
 from snowsplat.data import ImageLoader, View
-from snowsplat.pipeline.blocks.merge import merge_blocks
 from snowsplat.pipeline.blocks.plan import Plan, plan_blocks
-from snowsplat.pipeline.blocks.train import train_blocks
+from snowsplat.pipeline.blocks.train import merge_blocks, train_blocks
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.benchmark import PlanOptions
 from snowsplat.pipeline.options.train import TrainOptions

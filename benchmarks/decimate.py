@@ -26,7 +26,7 @@ import torch
 
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
-from snowsplat.pipeline.decimate import Decimation, refine
+from snowsplat.pipeline.convert import Decimation, refine
 from snowsplat.pipeline.output.image_files import write_png
 from snowsplat.pipeline.output.scene_source import cameras_of, photos_of
 from snowsplat.project.project import Project

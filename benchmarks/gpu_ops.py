@@ -19,7 +19,7 @@ from torch import Tensor
 from workloads import Workload
 
 from snowsplat import ops
-from snowsplat.ops.cuda import sorting
+from snowsplat.ops.cuda import tiling
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import view_of
@@ -71,7 +71,7 @@ def every_op(
         with sums_in_order(in_order):
             _ops_of(random_scene(1200, 20, 18), device, torch.float32)
     say("ops: sorts as for many keys, of several blocks, too")
-    with mock.patch.multiple(sorting, FEW=0, MOST_ADDED=0):
+    with mock.patch.multiple(tiling, FEW=0, MOST_ADDED=0):
         _ops_of(random_scene(*sizes[2]), device, torch.float32)
         ops.neighbours(torch.rand(2100, 3).to(device), 1)
     if wide:

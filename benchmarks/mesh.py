@@ -31,7 +31,7 @@ from snowsplat import ops
 from snowsplat.ops import reference
 from snowsplat.pipeline import mesh as pipeline_mesh
 from snowsplat.pipeline.mesh import surface_of
-from snowsplat.pipeline.options.surface import MeshOptions
+from snowsplat.pipeline.options.scene import MeshOptions
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.pipeline.train import train

@@ -22,8 +22,7 @@ from tests.scenes.street_dataset import DATASET_FROM_SCENE, walk_along
 from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at
-from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.photographer import take_photos, walk
+from snowsplat.synthetic.photographer import Lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 

@@ -26,8 +26,7 @@ from torch import Tensor
 from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import invert_rigid
-from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
+from snowsplat.synthetic.photographer import Lens, phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 

@@ -45,10 +45,8 @@ from torch import Tensor
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import Truth
 from snowsplat.synthetic import textures as paint
-from snowsplat.synthetic.lens import CentredLens
-from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
-from snowsplat.synthetic.scene import Scene, SceneObject
+from snowsplat.synthetic.photographer import CentredLens, phone_lens, take_photos, walk
+from snowsplat.synthetic.scene import Lamp, Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.trajectory.video_file import video_writer

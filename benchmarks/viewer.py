@@ -31,10 +31,8 @@ from snowsplat.data import Dataset, Points, View
 from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.process import single_threaded
-from snowsplat.viewer.live.curves import SampledPsnr
-from snowsplat.viewer.live.display import Display
-from snowsplat.viewer.live.pictures import draw
-from snowsplat.viewer.live.training import TrainingViewer
+from snowsplat.viewer.live.pictures import Display, draw
+from snowsplat.viewer.live.training import SampledPsnr, TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer
 
 MODES = ("color", "depth", "alpha", "normals", "points", "ellipsoids", "cost")

@@ -38,8 +38,7 @@ from snowsplat.scene.geometry import (
     transform_points,
 )
 from snowsplat.scene.render import render
-from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.photographer import depth_map, phone_lens, photograph, walk
+from snowsplat.synthetic.photographer import Lens, depth_map, phone_lens, photograph, walk
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.training.core.trainer import Trainer

@@ -13,8 +13,8 @@ from snowsplat import extras
 from snowsplat.cli import main as cli
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.pipeline.convert import convert
-from snowsplat.pipeline.options.convert import Edits
-from snowsplat.pipeline.quality import PRESETS
+from snowsplat.pipeline.options.make import PRESETS
+from snowsplat.pipeline.options.scene import Edits
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 

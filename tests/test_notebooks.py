@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 import torch
 
-from snowsplat.pipeline.quality import PRESETS
+from snowsplat.pipeline.options.make import PRESETS
 from snowsplat.synthetic import photographer
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 

@@ -13,10 +13,8 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from snowsplat.pipeline.options.benchmark import BenchmarkOptions, PlanOptions
-from snowsplat.pipeline.options.convert import Edits
 from snowsplat.pipeline.options.make import MakeOptions
-from snowsplat.pipeline.options.publish import PublishOptions
-from snowsplat.pipeline.options.surface import MeshOptions
+from snowsplat.pipeline.options.scene import Edits, MeshOptions, PublishOptions
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.options.video import VideoOptions
 from snowsplat.sfm.options import DatasetOptions

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from scenes import Shots
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.extras.lift.edges import find_links
+from snowsplat.extras.lift.surface import find_links
 from snowsplat.scene.render import render
 from training import Example, examples
 

@@ -11,9 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from scenes import FOCAL
-from snowsplat.extras.lift.discs import OPACITY, discs
-from snowsplat.extras.lift.edges import find_links
-from snowsplat.extras.lift.surface import surface_of
+from snowsplat.extras.lift.lift import OPACITY, discs
+from snowsplat.extras.lift.surface import find_links, surface_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 

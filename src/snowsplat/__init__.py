@@ -34,9 +34,8 @@ if TYPE_CHECKING:
     from snowsplat.extras.lift.refine_photo import refine_photo
     from snowsplat.formats import read_gaussians
     from snowsplat.pipeline.benchmark.run import benchmark
-    from snowsplat.pipeline.blocks.merge import merge_blocks
     from snowsplat.pipeline.blocks.plan import plan_blocks
-    from snowsplat.pipeline.blocks.train import train_blocks
+    from snowsplat.pipeline.blocks.train import merge_blocks, train_blocks
     from snowsplat.pipeline.clean import clean
     from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.convert import convert
@@ -45,16 +44,15 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.make import make
     from snowsplat.pipeline.observer import Observer
     from snowsplat.pipeline.options.benchmark import BenchmarkOptions, PlanOptions
-    from snowsplat.pipeline.options.convert import Edits
     from snowsplat.pipeline.options.make import MakeOptions
-    from snowsplat.pipeline.options.publish import PublishOptions
+    from snowsplat.pipeline.options.scene import Edits, PublishOptions
     from snowsplat.pipeline.options.train import TrainOptions
     from snowsplat.pipeline.options.video import VideoOptions
     from snowsplat.pipeline.output.scene_files import write_gaussians
     from snowsplat.pipeline.output.scene_source import load_trained
     from snowsplat.pipeline.publish import publish
     from snowsplat.pipeline.render import render_images
-    from snowsplat.pipeline.run.train_result import TrainingStopped
+    from snowsplat.pipeline.run.results import TrainingStopped
     from snowsplat.pipeline.train import resume, train
     from snowsplat.pipeline.videos import render_video
     from snowsplat.scene.camera import Camera
@@ -73,7 +71,7 @@ _MODULES = {
     "Compute": "pipeline.compute",
     "Dataset": "data",
     "DepthSource": "extras.lift.options",
-    "Edits": "pipeline.options.convert",
+    "Edits": "pipeline.options.scene",
     "FitOptions": "extras.image.options",
     "Gaussians": "scene.gaussians",
     "GlobeOptions": "extras.globe.options",
@@ -86,7 +84,7 @@ _MODULES = {
     "TrainConfig": "training.settings.config",
     "TrainOptions": "pipeline.options.train",
     "Trainer": "training.core.trainer",
-    "TrainingStopped": "pipeline.run.train_result",
+    "TrainingStopped": "pipeline.run.results",
     "UserError": "util.errors",
     "VideoOptions": "pipeline.options.video",
     "View": "data",
@@ -105,8 +103,8 @@ _MODULES = {
     "BenchmarkOptions": "pipeline.options.benchmark",
     "benchmark": "pipeline.benchmark.run",
     "PlanOptions": "pipeline.options.benchmark",
-    "PublishOptions": "pipeline.options.publish",
-    "merge_blocks": "pipeline.blocks.merge",
+    "PublishOptions": "pipeline.options.scene",
+    "merge_blocks": "pipeline.blocks.train",
     "parts_of": "training.parts.list",
     "plan_blocks": "pipeline.blocks.plan",
     "train_blocks": "pipeline.blocks.train",

@@ -11,7 +11,7 @@ import torch
 
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
 from snowsplat.pipeline.convert import transform_of
-from snowsplat.pipeline.options.convert import Edits, file_size
+from snowsplat.pipeline.options.scene import Edits, file_size
 from snowsplat.scene import edit
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras

@@ -11,8 +11,7 @@ from snowsplat.cli import view
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline import demo
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.options.make import MakeOptions
-from snowsplat.pipeline.quality import PRESETS
+from snowsplat.pipeline.options.make import PRESETS, MakeOptions
 
 from ..scenes.coarse import coarse_still_life
 

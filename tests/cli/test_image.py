@@ -13,7 +13,7 @@ from PIL import Image
 
 from snowsplat.extras.image.compact_file import read_compact
 from snowsplat.extras.image.fit_image import FILES
-from snowsplat.scene.pixels import to_8bit
+from snowsplat.scene.render import to_8bit
 
 from ..extras.image.photos import photo
 

@@ -17,8 +17,8 @@ from snowsplat.pipeline import all_photos, make_plan
 from snowsplat.pipeline import make as make_module
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.make import STAGES
+from snowsplat.pipeline.options.make import PRESETS
 from snowsplat.pipeline.output.scene_source import load_trained, load_viewable
-from snowsplat.pipeline.quality import PRESETS
 from snowsplat.project.project import MAKE_RECORD as RECORD
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import TrainingFolder

@@ -44,7 +44,7 @@ def test_mesh_and_points_of_a_training(run, out, tmp_path):
 def test_errors_are_one_line(refused, out, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    monkeypatch.setattr("snowsplat.pipeline.options.surface.find_spec", lambda name: None)
+    monkeypatch.setattr("snowsplat.pipeline.options.scene.find_spec", lambda name: None)
     monkeypatch.setattr("snowsplat.formats.mesh_files.find_spec", lambda name: None)
     for arguments, message in (
         (("mesh",), "-o"),

@@ -7,8 +7,8 @@ import pytest
 import torch
 from tests.gaussians import gaussians_in_box
 
+from snowsplat.cli.command import next_step, see_and_share
 from snowsplat.cli.main import SUBCOMMANDS
-from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.subcommands import _WORDS
 from snowsplat.formats import write_gaussians
 from snowsplat.util.messages import message

@@ -6,8 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.step_progress import StepProgress
+from snowsplat.cli.observer import StepProgress, TerminalObserver
 
 
 class Terminal(io.StringIO):

@@ -3,8 +3,7 @@
 import pytest
 
 from snowsplat.cli import main as cli
-from snowsplat.cli.flag_errors import spellings
-from snowsplat.cli.other_trainers import _FLAGS
+from snowsplat.cli.flag_errors import _FLAGS, spellings
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand
 
 

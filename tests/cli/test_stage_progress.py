@@ -4,8 +4,8 @@ import io
 
 import pytest
 
-from snowsplat.cli import stage_progress
-from snowsplat.cli.stage_progress import StageProgress
+from snowsplat.cli import observer
+from snowsplat.cli.observer import StageProgress
 
 
 class Clock:
@@ -18,7 +18,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(stage_progress, "time", clock)
+    monkeypatch.setattr(observer, "time", clock)
     return clock
 
 

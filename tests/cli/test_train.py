@@ -14,7 +14,7 @@ import pytest
 from snowsplat.cli.main import parse
 from snowsplat.cli.train import Train
 from snowsplat.formats import read_gaussians
-from snowsplat.pipeline.run.train_result import TrainResult
+from snowsplat.pipeline.run.results import TrainResult
 from snowsplat.pipeline.run.training_run import TrainingRun
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint

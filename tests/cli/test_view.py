@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.cli import page_flags
+from snowsplat.cli import pages
 from snowsplat.cli.main import main
 from snowsplat.cli.pages import for_other_computers, opener_of
 from snowsplat.formats import read_gaussians, write_gaussians
@@ -71,10 +71,10 @@ def test_a_real_browser_at_the_printed_address(start, out):
 @pytest.fixture
 def served(run, monkeypatch):
     """Run `view` until it waits: its result, the opened addresses, the scene and its title."""
-    from snowsplat.pipeline import view as viewing
+    from snowsplat.pipeline import publish
     from snowsplat.pipeline.output.scene_source import ViewableScene
 
-    site, ready = viewing.site, ViewableScene.ready
+    site, ready = publish.site, ViewableScene.ready
 
     def served(*arguments: object, environment: Sequence[str] = ()):
         for name in ("SSH_CONNECTION", "SSH_TTY", "DISPLAY", "WAYLAND_DISPLAY"):
@@ -83,11 +83,11 @@ def served(run, monkeypatch):
             monkeypatch.setenv(name, ":0")
         opened, shown, done = [], [], threading.Event()
         monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), done.set()))
-        monkeypatch.setattr(viewing, "site", lambda *a, **k: (shown.append(a[0]), site(*a, **k))[1])
+        monkeypatch.setattr(publish, "site", lambda *a, **k: (shown.append(a[0]), site(*a, **k))[1])
         monkeypatch.setattr(
             ViewableScene, "ready", lambda self: (shown.append(self), ready(self))[1]
         )
-        monkeypatch.setattr(page_flags, "wait", lambda: done.wait(0.3))
+        monkeypatch.setattr(pages, "wait", lambda: done.wait(0.3))
         result = run("view", *arguments)
         assert result.code == 0, result.err
         return result, opened, shown[:2]

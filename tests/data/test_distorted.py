@@ -19,7 +19,7 @@ from snowsplat.data.judge.verdict import judge
 from snowsplat.data.lens.models import COLMAP_MODELS, lens_of
 from snowsplat.data.maps.map_files import to_z
 from snowsplat.data.photos.decode import load_image, load_thumbnail
-from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
+from snowsplat.pipeline.blocks.plan import write_block_dataset
 from snowsplat.util.errors import UserError
 
 W, H = 160, 120

@@ -2,8 +2,7 @@
 
 import torch
 
-from snowsplat.evaluation.color_alignment import color_aligned, color_fit
-from snowsplat.evaluation.metrics import compare
+from snowsplat.evaluation.metrics import color_aligned, color_fit, compare
 
 
 def images():

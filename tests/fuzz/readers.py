@@ -606,7 +606,7 @@ def _make_checkpoint(folder: Path) -> None:
 
 
 def _read_checkpoint(folder: Path) -> Any:
-    from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
+    from snowsplat.pipeline.run.training_files import CheckpointMeta
 
     loaded = checkpoint.load(folder / "step_000005.safetensors")
     CheckpointMeta.from_checkpoint(loaded)

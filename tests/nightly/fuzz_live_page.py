@@ -46,9 +46,8 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset  # noqa: E402
 from snowsplat.training.core.trainer import Trainer  # noqa: E402
 from snowsplat.training.settings.config import TrainConfig  # noqa: E402
 from snowsplat.viewer.live import browser as live_browser  # noqa: E402
-from snowsplat.viewer.live.curves import SampledPsnr  # noqa: E402
-from snowsplat.viewer.live.messages import parse  # noqa: E402
-from snowsplat.viewer.live.training import TrainingViewer  # noqa: E402
+from snowsplat.viewer.live.browser import parse  # noqa: E402
+from snowsplat.viewer.live.training import SampledPsnr, TrainingViewer  # noqa: E402
 from snowsplat.viewer.live.viewer import NetworkViewer  # noqa: E402
 
 BOUND = 48.0  # MiB

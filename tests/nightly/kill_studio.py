@@ -43,7 +43,7 @@ from browser import Browser, BrowserError, chromium
 from kill.harness import names_in
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
-from snowsplat.pipeline.film import moved_film, page_frames
+from snowsplat.pipeline.edit import moved_film, page_frames
 from snowsplat.project.edit_record import read_record
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.site_folder import SiteFolder

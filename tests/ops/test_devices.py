@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from snowsplat import ops
-from snowsplat.ops.cuda import availability, inventory
+from snowsplat.ops.cuda import availability
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import Message
 
@@ -223,7 +223,7 @@ def test_the_inventory_of_a_machine(machine, monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: memory, raising=False)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index: (15 << 30, 16 << 30))
     machine.capabilities = [(7, 0), (6, 1)]
-    found = inventory.inventory()
+    found = availability.inventory()
     assert json.loads(json.dumps(found)) == found
     first, second = found["devices"]
     assert first == {
@@ -236,7 +236,7 @@ def test_the_inventory_of_a_machine(machine, monkeypatch):
     assert second["why_unused"] == TOO_OLD
     assert (found["has_gpu"], found["why_unused"], found["driver_cuda"]) == (True, None, "12.4")
     machine.usable, machine.driver = False, None
-    found = inventory.inventory()
+    found = availability.inventory()
     assert (found["devices"], found["has_gpu"], found["driver_cuda"]) == ([], False, None)
     assert "no NVIDIA driver" in found["why_unused"]
 

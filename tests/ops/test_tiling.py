@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.ops import native as natives
-from snowsplat.ops.cuda import sorting
+from snowsplat.ops.cuda import tiling
 from snowsplat.ops.cuda.kernels import KERNELS, Run
 from snowsplat.util.native_layout import TILE, Fields
 
@@ -72,7 +72,7 @@ def sort(
     a, b, c, d = (torch.full((n + 8,), 99, dtype=dtype) for dtype in dtypes)
     a[:n] = keys
     there = None if count is None else torch.tensor([count])
-    got, values = sorting.sort_pairs(run, n, a, b, c, d, bits, count=there, rows=True)
+    got, values = tiling.sort_pairs(run, n, a, b, c, d, bits, count=there, rows=True)
     for tensor in (a, b, c, d):
         assert (tensor[n:] == 99).all()
     return got[:n], values[:n]
@@ -108,8 +108,8 @@ def test_sort_as_for_many_keys(
     run: Run, dtype: torch.dtype, n: int, most_added: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """More keys per block; a kernel of its own adds the counts of the blocks."""
-    monkeypatch.setattr(sorting, "FEW", 0)
-    monkeypatch.setattr(sorting, "MOST_ADDED", most_added)
+    monkeypatch.setattr(tiling, "FEW", 0)
+    monkeypatch.setattr(tiling, "MOST_ADDED", most_added)
     keys = random_keys(n, n, dtype)
     plain = [k & 0xFFFF for k in unsigned(keys)]
     got, values = sort(run, keys, (0, 16))
@@ -123,7 +123,7 @@ def test_sort_as_for_many_keys(
 def test_sort_of_a_count_on_the_device(
     run: Run, count: int, most_added: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sorting, "MOST_ADDED", most_added)
+    monkeypatch.setattr(tiling, "MOST_ADDED", most_added)
     keys = random_keys(4, 2 * BLOCK, torch.int16, distinct=50)
     there = min(count, 2 * BLOCK)
     got, values = sort(run, keys, (0, 6), count)
@@ -137,7 +137,7 @@ def test_sort_of_given_values(run: Run) -> None:
     order = torch.tensor(sorted(range(500), key=lambda i: unsigned(keys)[i]))
     wanted = values[order]
     spare = torch.empty_like(keys), torch.empty_like(values)
-    got = sorting.sort_pairs(run, 500, keys.clone(), spare[0], values.clone(), spare[1], (0, 32))
+    got = tiling.sort_pairs(run, 500, keys.clone(), spare[0], values.clone(), spare[1], (0, 32))
     assert torch.equal(got[0], keys[order])
     assert torch.equal(got[1], wanted)
 
@@ -155,7 +155,7 @@ def test_exclusive_scan(run: Run, n: int, in_place: bool) -> None:
     out = values if in_place else torch.full_like(values, 77)
     margin = int(out[n])
     total = torch.full((1,), -5)
-    sorting.exclusive_scan(run, n, values, out, total)
+    tiling.exclusive_scan(run, n, values, out, total)
     assert out.tolist() == [*wanted[:n], margin]
     assert total.item() == wanted[n]
 
@@ -164,7 +164,7 @@ def test_exclusive_scan_of_more_blocks_than_threads(run: Run) -> None:
     n = 300 * 1024 + 5
     values, out = torch.ones(n, dtype=torch.int32), torch.empty(n, dtype=torch.int32)
     total = torch.zeros(1, dtype=torch.int64)
-    sorting.exclusive_scan(run, n, values, out, total)
+    tiling.exclusive_scan(run, n, values, out, total)
     assert torch.equal(out, torch.arange(n, dtype=torch.int32))
     assert total.item() == n
 
@@ -173,7 +173,7 @@ def test_exclusive_scan_beyond_32_bits(run: Run) -> None:
     most = 2**31 - 1
     values, out = torch.full((2000,), most, dtype=torch.int32), torch.zeros(2000, dtype=torch.int32)
     total = torch.zeros(1, dtype=torch.int64)
-    sorting.exclusive_scan(run, 2000, values, out, total)
+    tiling.exclusive_scan(run, 2000, values, out, total)
     assert unsigned(out) == [min(i * most, 2**32 - 1) for i in range(2000)]
     assert total.item() == 2000 * most
 

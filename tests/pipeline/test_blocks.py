@@ -16,11 +16,9 @@ from PIL import Image
 from snowsplat import load_dataset, read_gaussians
 from snowsplat.cli import main as cli
 from snowsplat.formats.ply import read_ply
-from snowsplat.pipeline.blocks.cells import Cell, cut, ground_axes
-from snowsplat.pipeline.blocks.content import block_content
-from snowsplat.pipeline.blocks.merge import merge_blocks
+from snowsplat.pipeline.blocks.content import Cell, block_content, cut, ground_axes
 from snowsplat.pipeline.blocks.plan import Plan, plan_blocks
-from snowsplat.pipeline.blocks.train import train_blocks
+from snowsplat.pipeline.blocks.train import merge_blocks, train_blocks
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.benchmark import PlanOptions
 from snowsplat.pipeline.options.train import TrainOptions

@@ -14,7 +14,7 @@ from snowsplat.data import load_dataset, read_dataset
 from snowsplat.data.judge.finding import Finding
 from snowsplat.pipeline.describe import describe
 from snowsplat.pipeline.options.train import TrainOptions
-from snowsplat.pipeline.run import camera_check
+from snowsplat.pipeline.run import dataset_check
 from snowsplat.pipeline.train import train
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
@@ -68,7 +68,7 @@ def test_photos_whose_poses_are_contradicted_are_left_out(tmp_path, monkeypatch,
     found = Finding("poses", "the poses of two are wrong", photos=names)
     everything = {v.name for v in load_dataset(dataset, hold_out=None).train}
     assert {*names} < everything
-    monkeypatch.setattr(camera_check, "judge", lambda dataset: [found])
+    monkeypatch.setattr(dataset_check, "judge", lambda dataset: [found])
     options = TrainOptions(settings=SHORT, hold_out=8)
     result = train(dataset, tmp_path / "out", options)
     assert [(each.photo, each.stage) for each in result.left_out] == [(n, "poses") for n in names]

@@ -9,7 +9,7 @@ import torch
 from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.formats.spz import spz_version
 from snowsplat.pipeline.convert import convert
-from snowsplat.pipeline.options.convert import Edits, file_size, gaussians_to_keep
+from snowsplat.pipeline.options.scene import Edits, file_size, gaussians_to_keep
 from snowsplat.pipeline.options.video import VideoSize
 from snowsplat.pipeline.videos import cameras_along
 from snowsplat.scene.camera import Camera

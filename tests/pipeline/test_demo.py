@@ -7,8 +7,7 @@ from snowsplat.data.lens.models import lens_of
 from snowsplat.pipeline.demo import compare_with_truth, is_accurate
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.synthetic import Truth
-from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.photographer import walk
+from snowsplat.synthetic.photographer import Lens, walk
 
 TRUTH = Truth(
     Lens(64, 48, 50.0, (0.0, 0.0, 0.0, 0.0)),

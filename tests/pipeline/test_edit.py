@@ -12,11 +12,9 @@ from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.sog import read_sog
-from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
-from snowsplat.pipeline.film import moved_film, page_frames
+from snowsplat.pipeline.edit import OtherScene, edit, moved_film, page_frames, undo_edits
 from snowsplat.pipeline.output.scene_source import load_viewable
-from snowsplat.pipeline.publish import publish
-from snowsplat.pipeline.view import viewed_scene
+from snowsplat.pipeline.publish import publish, viewed_scene
 from snowsplat.project import edit_record
 from snowsplat.project.edit_record import Note, PageEdit, read_record, shown_file
 from snowsplat.project.page_film import PageFilm

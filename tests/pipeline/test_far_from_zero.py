@@ -12,14 +12,13 @@ import torch
 from snowsplat.data import load_dataset
 from snowsplat.data.colmap.model import posed_camera, read_model, read_points, write_model
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.pipeline.blocks.merge import merge_blocks
 from snowsplat.pipeline.blocks.plan import plan_blocks
-from snowsplat.pipeline.blocks.train import train_blocks
+from snowsplat.pipeline.blocks.train import merge_blocks, train_blocks
 from snowsplat.pipeline.clean import clean
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.benchmark import PlanOptions
-from snowsplat.pipeline.options.convert import Edits
+from snowsplat.pipeline.options.scene import Edits
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained, load_viewable
 from snowsplat.pipeline.train import train

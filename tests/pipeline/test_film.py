@@ -6,7 +6,7 @@ import av
 import pytest
 import torch
 
-from snowsplat.pipeline.film import film, film_preview, write_keys
+from snowsplat.pipeline.edit import film, film_preview, write_keys
 from snowsplat.pipeline.options.video import VideoSize
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.videos import cameras_along

@@ -8,7 +8,7 @@ from snowsplat.data import load_dataset
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.convert import convert, transform_of
-from snowsplat.pipeline.options.convert import Edits
+from snowsplat.pipeline.options.scene import Edits
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import cameras_of
 from snowsplat.pipeline.train import train
@@ -19,7 +19,7 @@ from snowsplat.util.errors import SettingError
 
 
 def test_the_photos_improve_a_decimated_scene(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("snowsplat.pipeline.decimate._REFINED_STEPS", 40)
+    monkeypatch.setattr("snowsplat.pipeline.convert._REFINED_STEPS", 40)
     train(dataset, tmp_path / "out", TrainOptions(settings={"iterations": 60}))
     count = len(read_gaussians(tmp_path / "out/point_cloud/iteration_60/point_cloud.ply")) // 3
     plain, refined = tmp_path / "plain.ply", tmp_path / "refined.ply"

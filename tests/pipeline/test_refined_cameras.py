@@ -16,7 +16,7 @@ from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.run.refined_cameras import with_refined, write_refined
-from snowsplat.pipeline.run.train_result import TrainResult
+from snowsplat.pipeline.run.results import TrainResult
 from snowsplat.pipeline.train import train
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.training.parts import pose_refinement

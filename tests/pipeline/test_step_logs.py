@@ -8,7 +8,7 @@ import pytest
 
 from snowsplat.pipeline.observer import Observer, Observers
 from snowsplat.pipeline.options.train import TrainOptions
-from snowsplat.pipeline.run.train_result import TrainingStopped
+from snowsplat.pipeline.run.results import TrainingStopped
 from snowsplat.pipeline.step_logs import COLUMNS, LOGS, CsvLog
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import TrainingFolder

@@ -14,7 +14,7 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.render import render_images
-from snowsplat.pipeline.run.train_result import TrainingStopped
+from snowsplat.pipeline.run.results import TrainingStopped
 from snowsplat.pipeline.train import resume, train
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.parts import unexplained

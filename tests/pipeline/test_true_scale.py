@@ -16,7 +16,7 @@ from snowsplat.data.frame.placement import PLACEMENT, Placement
 from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe import describe
-from snowsplat.pipeline.options.convert import Edits
+from snowsplat.pipeline.options.scene import Edits
 from snowsplat.pipeline.true_scale import KnownDistance
 from snowsplat.project.edit_record import EditRecord, record_file
 from snowsplat.project.project import Project

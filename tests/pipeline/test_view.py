@@ -11,9 +11,9 @@ from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.lod import INDEX, read_index
-from snowsplat.pipeline import view
+from snowsplat.pipeline import publish
 from snowsplat.pipeline.observer import Observer
-from snowsplat.pipeline.view import viewed_scene
+from snowsplat.pipeline.publish import viewed_scene
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
@@ -47,7 +47,7 @@ def test_a_small_scene_is_one_file(scene):
 
 
 def test_a_large_scene_is_shown_in_levels_until_the_end(scene, monkeypatch):
-    monkeypatch.setattr(view, "_LARGE", 499)
+    monkeypatch.setattr(publish, "_LARGE_HERE", 499)
     notes = Notes()
     with viewed_scene(scene, observer=notes) as viewed:
         assert viewed.gaussians == 500

@@ -11,11 +11,10 @@ from snowsplat.formats import write_gaussians
 from snowsplat.pipeline.clean import clean
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.observer import Observer
-from snowsplat.pipeline.options.convert import Edits
+from snowsplat.pipeline.options.scene import Edits
 from snowsplat.pipeline.options.train import TrainOptions
-from snowsplat.pipeline.publish import publish
+from snowsplat.pipeline.publish import publish, viewed_scene
 from snowsplat.pipeline.train import train
-from snowsplat.pipeline.view import viewed_scene
 
 
 class Waits(Observer):

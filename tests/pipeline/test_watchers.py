@@ -14,9 +14,8 @@ import pytest
 
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
-from snowsplat.pipeline.run import watchers
-from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.run.watchers import FOLDER, socket_in
+from snowsplat.pipeline.run import live_page
+from snowsplat.pipeline.run.live_page import FOLDER, LivePage, socket_in
 from snowsplat.pipeline.train import train
 from snowsplat.pipeline.watch import watch
 
@@ -157,7 +156,7 @@ def test_the_socket_of_a_killed_training_is_harmless(dataset, tmp_path):
 def test_the_name_of_the_folder_may_be_long(tmp_path, monkeypatch, files, name):
     """A path of a socket has at most 107 bytes here, and 103 on macOS."""
     if files is not None:
-        monkeypatch.setattr(watchers, "_OPEN_FILES", files)
+        monkeypatch.setattr(live_page, "_OPEN_FILES", files)
     out = tmp_path / name
     out.mkdir()
     with socket.socket(socket.AF_UNIX) as listener, socket.socket(socket.AF_UNIX) as watcher:

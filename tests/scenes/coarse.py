@@ -2,13 +2,13 @@
 
 import pytest
 
-from snowsplat.synthetic import light, still_life
+from snowsplat.synthetic import scene, still_life
 
 
 def coarse_light(patch: pytest.MonkeyPatch, spacing: float = 0.1) -> None:
     """Light at fewer points, ``spacing`` metres apart."""
-    patch.setattr(light, "_SPACING", spacing)
-    patch.setattr(light, "_MOST_POINTS", 12)
+    patch.setattr(scene, "_SPACING", spacing)
+    patch.setattr(scene, "_MOST_POINTS", 12)
 
 
 def coarse_still_life(patch: pytest.MonkeyPatch, texel: float = 4.0) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from torch import Tensor
 
 from snowsplat.scene.geometry import invert_rigid
-from snowsplat.synthetic.lens import Lens
+from snowsplat.synthetic.photographer import Lens
 from snowsplat.synthetic.scene import Scene
 
 

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from snowsplat.synthetic.lens import CentredLens
-from snowsplat.trajectory.spherical_metadata import panorama_xmp
+from snowsplat.synthetic.photographer import CentredLens
+from snowsplat.trajectory.video_file import panorama_xmp
 
 _NEWTON_STEPS = 8
 _FISHEYE_DISTORTION = (0.03, -0.008, 0.001, 0.0)  # OPENCV_FISHEYE: k1 … k4; of an action camera

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from snowsplat.scene.geometry import invert_rigid
 from snowsplat.synthetic import textures as paint
-from snowsplat.synthetic.lens import CentredLens
-from snowsplat.synthetic.photographer import RAYS, develop, tiles
+from snowsplat.synthetic.photographer import RAYS, CentredLens, develop, tiles
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import FLOOR, LAMP

@@ -11,8 +11,7 @@ import math
 import numpy as np
 
 from snowsplat.synthetic import textures as paint
-from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.scene import Scene, SceneObject
+from snowsplat.synthetic.scene import Lamp, Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 
 #: From the middle of the road to the façades.

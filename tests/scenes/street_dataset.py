@@ -14,8 +14,7 @@ from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at
 from snowsplat.sfm.progress import Report, silent
-from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.photographer import roll, take_photos
+from snowsplat.synthetic.photographer import Lens, roll, take_photos
 from snowsplat.synthetic.scene import Scene
 
 from .depth import distances

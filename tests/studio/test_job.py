@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.pipeline.quality import PRESETS
+from snowsplat.pipeline.options.make import PRESETS
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera import Camera

@@ -6,9 +6,8 @@ import numpy as np
 import torch
 
 from snowsplat.scene.geometry import look_at
-from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.scene import Scene, SceneObject
+from snowsplat.synthetic.photographer import Lens
+from snowsplat.synthetic.scene import Lamp, Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid
 
 from ..scenes.depth import depth_map

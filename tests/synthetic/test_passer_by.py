@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.photographer import phone_lens, walk
-from snowsplat.synthetic.scene import Scene, SceneObject
+from snowsplat.synthetic.scene import Lamp, Scene, SceneObject
 from snowsplat.synthetic.shapes import Box
 
 from ..scenes.depth import depth_map

@@ -8,10 +8,8 @@ from PIL import Image
 from snowsplat.data.colmap.model import read_model
 from snowsplat.scene.geometry import rotation_from_quat, transform_points
 from snowsplat.synthetic import write_synthetic_photos
-from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import photograph, walk
-from snowsplat.synthetic.scene import Scene, SceneObject
+from snowsplat.synthetic.photographer import Lens, photograph, walk
+from snowsplat.synthetic.scene import Lamp, Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
 from ..scenes.coarse import coarse_still_life

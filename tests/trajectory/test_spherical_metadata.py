@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from snowsplat.sfm.ingest.content.panorama import spherical_video
-from snowsplat.trajectory.spherical_metadata import mark_as_spherical
-from snowsplat.trajectory.video_file import video_writer
+from snowsplat.trajectory.video_file import mark_as_spherical, video_writer
 
 WIDTH, HEIGHT, FRAMES = 128, 64, 8
 

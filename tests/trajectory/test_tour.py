@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from snowsplat.trajectory.tour import MOST_CAMERAS, in_order, short_tour
+from snowsplat.trajectory.follow import MOST_CAMERAS, in_order, short_tour
 
 from .rigs import camera_at, ring
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from snowsplat.cli.command import Exit, JsonCommand
-from snowsplat.cli.print_message import print_message
+from snowsplat.cli.command import Exit, JsonCommand, print_message
 from snowsplat.pipeline.options.benchmark import BenchmarkOptions
 from snowsplat.util.settings import group, needed
 

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from snowsplat.cli.command import Command, Exit
-from snowsplat.cli.next_steps import next_step, see_and_share
+from snowsplat.cli.command import Command, Exit, next_step, print_message, see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.benchmark import PlanOptions
@@ -115,7 +113,7 @@ class Blocks(Command):
 
     def _train(self, folder: Path) -> Exit | None:
         from snowsplat.pipeline.blocks.train import train_blocks
-        from snowsplat.pipeline.run.train_result import TrainingStopped
+        from snowsplat.pipeline.run.results import TrainingStopped
 
         with TerminalObserver(self.training.quiet) as observer:
             try:
@@ -134,7 +132,7 @@ class Blocks(Command):
         return None
 
     def _merge(self, folder: Path) -> Exit | None:
-        from snowsplat.pipeline.blocks.merge import merge_blocks
+        from snowsplat.pipeline.blocks.train import merge_blocks
 
         merged = merge_blocks(folder, self.output)
         kept, trained = sum(merged.gaussians), sum(merged.trained)

@@ -1,9 +1,13 @@
-"""`Command`: a subcommand is a class of settings, which are its arguments and flags, with `run`."""
+"""`Command`: a subcommand is a class of settings, which are its arguments and flags, with `run`.
+
+What all of them print is here, too.
+"""
 
 from __future__ import annotations
 
 import json as json_text
 import math
+import shlex
 import sys
 from collections.abc import Mapping
 from contextlib import redirect_stdout
@@ -12,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from snowsplat.util.flags import settings_from
-from snowsplat.util.messages import Message
+from snowsplat.util.messages import Message, as_message, message
 from snowsplat.util.settings import Settings, switch
 
 _OF_MESSAGE = {each.name for each in fields(Message)}
@@ -92,3 +96,22 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
+
+
+def print_message(key: str | Message, /, **values: Any) -> None:
+    """Print a message at once, in the language of the program; see `message`."""
+    print(Message(key, values) if isinstance(key, str) else as_message(key), flush=True)
+
+
+def next_step(purpose: Message, *words: object) -> Message:
+    """A purpose and the command for it: "to see it: snowsplat view 'my garden'"."""
+    command = shlex.join(["snowsplat", *map(str, words)])
+    return message("{purpose}: {command}", purpose=purpose, command=command)
+
+
+def see_and_share(scene: Path) -> Message:
+    """How to see and share a scene: a file, or the output folder of `train` or `make`."""
+    name = scene.resolve().name.split(".")[0].removesuffix("_scene") or "scene"
+    see = next_step(message("to see it"), "view", scene)
+    share = next_step(message("to share it"), "publish", scene, "-o", f"{name}_site")
+    return message("{see}; {share}", see=see, share=share)

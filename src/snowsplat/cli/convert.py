@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from snowsplat.cli.command import JsonCommand
-from snowsplat.cli.next_steps import see_and_share
+from snowsplat.cli.command import JsonCommand, print_message, see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.options import common
-from snowsplat.pipeline.options.convert import Edits
+from snowsplat.pipeline.options.scene import Edits
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from snowsplat.cli.command import Command, Exit
+from snowsplat.cli.command import Command, Exit, print_message, see_and_share
 from snowsplat.cli.make import print_summary
-from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.print_message import print_message
 from snowsplat.cli.view import View
 from snowsplat.util.flags import command_line, with_flags, words
 from snowsplat.util.messages import message

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from snowsplat.cli.command import Exit, JsonCommand
-from snowsplat.cli.print_message import print_message
+from snowsplat.cli.command import Exit, JsonCommand, print_message
 from snowsplat.util.safe_json import printable
 
 

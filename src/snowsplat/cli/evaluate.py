@@ -6,9 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from snowsplat.cli.command import JsonCommand
-from snowsplat.cli.next_steps import next_step
-from snowsplat.cli.print_message import print_message
+from snowsplat.cli.command import JsonCommand, next_step, print_message
 from snowsplat.cli.scene_choice import SceneChoice
 from snowsplat.util.messages import message
 from snowsplat.util.settings import group, setting

@@ -3,18 +3,22 @@
 tyro parses the flags. If it rejects them, the arguments are examined here: flags of other trainers
 are translated, another unknown flag gets the most similar one as a suggestion, and an invalid value
 is explained as it is in Python, with the declaration of the setting.
+
+Flags and words of gsplat's `simple_trainer.py` and of nerfstudio are not accepted, because what
+they do differs in detail: an error names what to use instead. Those of the reference implementation
+are accepted, see `reference_flags`; only the name of its `convert.py` is that of another subcommand
+here.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from functools import reduce
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
-from snowsplat.cli import other_trainers
 from snowsplat.cli.command import Command
 from snowsplat.cli.subcommands import SUBCOMMANDS
 from snowsplat.training.settings.recipes import RECIPES
@@ -25,6 +29,41 @@ from snowsplat.util.settings import allowed, kinds_of, shown, suggestion
 
 _FLAG = re.compile(r"-[^\d.]")
 _FRAME = "│|╭╮╰╯─┌┐└┘+-= "
+# The flag to use -> flags of the others, without the group before a dot.
+_FLAGS = {
+    "-o": "result-dir output-dir output-path experiment-name",
+    "-r": "data-factor downscale-factor camera-res-scale-factor",
+    "--iterations": "max-steps max-num-iterations steps max-iterations num-iterations",
+    "--max-gaussians": "cap-max max-gs-num",
+    "--eval": "test-every eval-mode eval-interval train-split-fraction",
+    "--test-iterations": "eval-steps steps-per-eval-all-images",
+    "--save-iterations": "save-steps ply-steps",
+    "--checkpoint-every": "steps-per-save",
+    "--resume": "load-dir load-checkpoint",
+    "--batch": "batch-size",
+    "--refine-poses": "pose-opt camera-optimizer",
+    "--exposure": "app-opt use-bilateral-grid use-bilagrid post-processing",
+    "--antialias": "rasterize-mode",
+    "--background": "random-bkgd background-color",
+    "--init": "init-type random-init",
+    "--view": "vis viewer",
+    "--ssim-weight": "ssim-lambda",
+    "--grad-threshold": "grow-grad2d densify-grad-thresh",
+    "--abs-grad": "absgrad use-absgrad",
+    "--densify-from": "refine-start-iter warmup-length",
+    "--densify-until": "refine-stop-iter stop-split-at",
+    "--densify-interval": "refine-every",
+    "--opacity-reset-interval": "reset-every reset-alpha-every",
+    "--log": "tb-every tensorboard",
+    "--processes": "num-devices",
+    "--lr-means": "means-lr",
+    "--lr-log-scales": "scales-lr",
+    "--lr-quats": "quats-lr",
+    "--lr-opacity-logits": "opacities-lr",
+    "--lr-sh-dc": "sh0-lr",
+    "--lr-sh-rest": "shN-lr",
+}
+_INPUTS = ["data", "data-dir", "ckpt", "load-config", "input"]
 
 
 def explained(command: type[Command], arguments: Sequence[str], printed: str) -> Message:
@@ -36,7 +75,7 @@ def explained(command: type[Command], arguments: Sequence[str], printed: str) ->
     names = [each.partition("=")[0] for each in arguments if _FLAG.match(each)]
     unknown = {name: name.replace("_", "-") for name in names}
     advised = {
-        name: other_trainers.advice(subcommand, spelling, flags)
+        name: advice(subcommand, spelling, flags)
         for name, spelling in unknown.items()
         if spelling not in flags
     }
@@ -53,8 +92,8 @@ def explained(command: type[Command], arguments: Sequence[str], printed: str) ->
         name, given, value = argument.partition("=")
         spelling = name.replace("_", "-")
         if spelling not in flags:
-            advice = suggestion(spelling, list(flags)) or message("leave it out")
-            return message("{name}: unknown flag; {advice}", name=printable(name), advice=advice)
+            hint = suggestion(spelling, list(flags)) or message("leave it out")
+            return message("{name}: unknown flag; {advice}", name=printable(name), advice=hint)
         hint, valid = flags[spelling]
         kinds = [each for each in kinds_of(hint) if each is not NoneType]
         if kinds == [bool]:
@@ -117,3 +156,26 @@ def _is_of(text: str, kind: Any) -> bool:
             return True
         return False
     return True
+
+
+def advice(subcommand: str, name: str, flags: Collection[str]) -> str | None:
+    """What to use for an unknown flag of a subcommand; None if it is not known.
+
+    Args:
+        name: the flag with "-" for "_", such as "--strategy.refine-every".
+        flags: those that the subcommand has.
+    """
+    *groups, word = name.removeprefix("--").split(".")
+    if word in _INPUTS and subcommand in SUBCOMMANDS:
+        return f"use no flag: snowsplat {subcommand} {SUBCOMMANDS[subcommand].usage}"
+    if (subcommand, name) in (("convert", "-s"), ("convert", "--source-path")):
+        return "convert.py is snowsplat sfm -s DATASET"
+    if groups and f"--{word}" in flags:
+        return f"use --{word}"
+    if word == "stop-overfitting":
+        return "leave it out; it was removed, because the default recipe does not overfit"
+    if word in ("save-ply", "disable-video"):
+        return "leave it out; train writes the scene as PLY, and render writes videos"
+    of_word = {w: new for new, words in _FLAGS.items() for w in words.split()}
+    new = next((of_word[w] for w in (word, *groups[::-1]) if w in of_word), None)
+    return f"use {new}" if new in flags else None

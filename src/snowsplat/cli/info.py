@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from snowsplat.cli.command import JsonCommand
-from snowsplat.cli.next_steps import next_step, see_and_share
+from snowsplat.cli.command import JsonCommand, next_step, see_and_share
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import printable

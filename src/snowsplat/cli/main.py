@@ -19,7 +19,7 @@ from contextlib import redirect_stderr
 from typing import TYPE_CHECKING, Any
 
 from snowsplat._version import __version__
-from snowsplat.cli.next_steps import next_step
+from snowsplat.cli.command import next_step
 from snowsplat.cli.pages import has_screen
 from snowsplat.cli.reference_flags import translated
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, overview

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snowsplat.cli.command import Exit, JsonCommand
+from snowsplat.cli.command import Exit, JsonCommand, print_message, see_and_share
 from snowsplat.cli.config_file import config
-from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
-from snowsplat.cli.page_flags import PageAddress
-from snowsplat.cli.print_message import print_message
+from snowsplat.cli.pages import PageAddress
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.pipeline.stage_lines import photos_of_last_part
@@ -24,8 +22,8 @@ from snowsplat.util.messages import Message, message, plural
 from snowsplat.util.settings import argument, group, setting, switch
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.make_result import MakeResult
     from snowsplat.pipeline.run.live_page import LivePage
+    from snowsplat.pipeline.run.results import MakeResult
 
 
 @dataclass(frozen=True, kw_only=True)

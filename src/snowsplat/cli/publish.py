@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from snowsplat.cli.command import JsonCommand
-from snowsplat.cli.next_steps import next_step
+from snowsplat.cli.command import JsonCommand, next_step, print_message
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
-from snowsplat.pipeline.options.publish import PublishOptions
+from snowsplat.pipeline.options.scene import PublishOptions
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.messages import message
 from snowsplat.util.settings import group, needed

@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from snowsplat.cli.command import JsonCommand
-from snowsplat.cli.next_steps import next_step, see_and_share
+from snowsplat.cli.command import JsonCommand, next_step, print_message, see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.print_message import print_message
 from snowsplat.cli.scene_choice import SceneChoice
 from snowsplat.pipeline.options.video import VideoOptions
 from snowsplat.util.errors import UserError

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from snowsplat.cli.command import JsonCommand
-from snowsplat.cli.next_steps import next_step
+from snowsplat.cli.command import JsonCommand, next_step, print_message
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.print_message import print_message
 from snowsplat.pipeline.options import common
 from snowsplat.sfm.options import DatasetOptions
 from snowsplat.util.errors import UserError

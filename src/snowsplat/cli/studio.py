@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from snowsplat.cli.command import Command
-from snowsplat.cli.page_flags import PageServer
-from snowsplat.cli.pages import opener_of, show
-from snowsplat.cli.print_message import print_message
+from snowsplat.cli.command import Command, print_message
+from snowsplat.cli.pages import PageServer, opener_of, show
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.util.settings import argument, group

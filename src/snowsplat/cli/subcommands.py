@@ -23,7 +23,8 @@ class Subcommand:
 
 def _load(name: str) -> type[Command]:
     # Only modules of this package; a package above hands over a function, see `extras.register`.
-    module = import_module(f"{__package__}.{name}")
+    file = "mesh" if name == "points" else name
+    module = import_module(f"{__package__}.{file}")
     found: type[Command] = getattr(module, name.capitalize())
     return found
 

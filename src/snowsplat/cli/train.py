@@ -9,12 +9,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from snowsplat.cli.command import Exit, JsonCommand
+from snowsplat.cli.command import Exit, JsonCommand, next_step, print_message, see_and_share
 from snowsplat.cli.config_file import config, training_in
-from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.page_flags import PageAddress
-from snowsplat.cli.print_message import print_message
+from snowsplat.cli.pages import PageAddress
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.util.errors import UserError
@@ -111,7 +109,7 @@ class Train(JsonCommand):
     def run(self) -> Any:
         """The exit code is 130 after Ctrl-C, with the scene and a checkpoint saved."""
         from snowsplat.pipeline.run import processes
-        from snowsplat.pipeline.run.train_result import TrainingStopped
+        from snowsplat.pipeline.run.results import TrainingStopped
         from snowsplat.project.training_folder import TrainingFolder
 
         if self.processes is not None and self.processes != 1 and processes.count() == 1:

@@ -6,10 +6,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from snowsplat.cli.command import Command
+from snowsplat.cli.command import Command, print_message
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.page_flags import PageServer
-from snowsplat.cli.print_message import print_message
+from snowsplat.cli.pages import PageServer
 from snowsplat.pipeline.options import common
 from snowsplat.util.settings import group, needed
 
@@ -46,7 +45,7 @@ class View(Command):
 
     def run(self) -> None:
         """Runs until Ctrl-C, the usual end."""
-        from snowsplat.pipeline.view import viewed_scene
+        from snowsplat.pipeline.publish import viewed_scene
         from snowsplat.viewer.http.static import static_app
 
         with (

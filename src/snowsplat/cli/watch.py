@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from snowsplat.cli.command import Command
 from snowsplat.cli.observer import WatchObserver
-from snowsplat.cli.page_flags import PageAddress
+from snowsplat.cli.pages import PageAddress
 from snowsplat.cli.scene_choice import SceneChoice
 from snowsplat.util.settings import group
 

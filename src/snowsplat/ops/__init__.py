@@ -12,7 +12,7 @@ from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.devices import default_device, device_name, resolve_device
 from snowsplat.ops.frusta import Frusta, points_in_frusta, points_in_spheres
 from snowsplat.ops.fusion import fuse_depth
-from snowsplat.ops.gaussian_parameters import GaussianParameters
+from snowsplat.ops.gaussian_parameters import GaussianParameters, View
 from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.nearest_neighbours import neighbours
 from snowsplat.ops.noise import add_noise
@@ -22,7 +22,6 @@ from snowsplat.ops.rasterizer import count_blended, rasterize, rasterize_median
 from snowsplat.ops.splats import SplatGradient, Splats2D
 from snowsplat.ops.statistic import accumulate_screen_statistics
 from snowsplat.ops.sweep import plane_sweep
-from snowsplat.ops.view import View
 
 __all__ = [
     "AdamRates",

@@ -11,11 +11,10 @@ from torch.autograd.function import once_differentiable
 
 from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, check_tensor
-from snowsplat.ops.gaussian_parameters import PARAMETERS
+from snowsplat.ops.gaussian_parameters import PARAMETERS, View, camera_params
 from snowsplat.ops.native import Struct
 from snowsplat.ops.projection import pose_gradient, project_vjp, visible_splats
 from snowsplat.ops.splats import COLORS, DEPTHS, MEANS2D, OPACITIES, RADII, Splats2D, packed_width
-from snowsplat.ops.view import View, camera_params
 
 #: Splats beyond this depth are removed: the default of gsplat.
 FAR = 1e10

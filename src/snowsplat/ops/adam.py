@@ -13,13 +13,14 @@ from snowsplat.ops.check import check_ids, variant
 from snowsplat.ops.gaussian_parameters import (
     PARAMETERS,
     GaussianParameters,
+    View,
+    camera_params,
     check_each,
     checked_parameters,
 )
 from snowsplat.ops.native import launch
 from snowsplat.ops.projection import rows_expected
 from snowsplat.ops.splats import SplatGradient
-from snowsplat.ops.view import View, camera_params
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,13 @@ from torch import Tensor
 from snowsplat.ops.gaussian_parameters import (
     PARAMETERS,
     GaussianParameters,
+    View,
+    camera_params,
     checked_parameters,
     gaussian_tensors,
 )
 from snowsplat.ops.projection import pose_gradient, project_vjp
 from snowsplat.ops.splats import SplatGradient
-from snowsplat.ops.view import View, camera_params
 
 #: In double, (t + _ROUNDING) − _ROUNDING is t rounded to a multiple of 2⁻⁴⁰. Sums of such numbers
 #: below 2¹³ are exact, so they do not depend on the order.

@@ -14,6 +14,8 @@ from snowsplat.ops.check import variant
 from snowsplat.ops.gaussian_parameters import (
     PARAMETERS,
     GaussianParameters,
+    View,
+    camera_params,
     check_each,
     checked_parameters,
     gaussian_tensors,
@@ -21,7 +23,6 @@ from snowsplat.ops.gaussian_parameters import (
 from snowsplat.ops.native import Struct, launch, query_size
 from snowsplat.ops.splats import SplatGradient, Splats2D, packed_width
 from snowsplat.ops.sums import sum_of_rows
-from snowsplat.ops.view import View, camera_params
 from snowsplat.util.native_layout import POSE_SUMS
 
 

@@ -44,10 +44,9 @@ from torch.nn.functional import conv2d
 from snowsplat.ops.adam import AdamRates, Moments
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.frusta import Frusta
-from snowsplat.ops.gaussian_parameters import PARAMETERS, GaussianParameters
+from snowsplat.ops.gaussian_parameters import PARAMETERS, GaussianParameters, View
 from snowsplat.ops.splats import SplatGradient, Splats2D
 from snowsplat.ops.sweep_reference import plane_sweep as plane_sweep
-from snowsplat.ops.view import View
 from snowsplat.util.native_layout import TILE
 
 LOW_PASS = 0.3  # pixels²: blurs every splat, so that it covers at least one pixel centre

@@ -8,7 +8,7 @@ docs/what-was-tried.md.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -17,6 +17,7 @@ from snowsplat.data import ImageLoader
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
+from snowsplat.pipeline.run.results import LastPart
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
@@ -30,7 +31,7 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.rates import DecayRates
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.stored import config_from_json
-from snowsplat.util.messages import Message, message
+from snowsplat.util.messages import message
 
 #: The steps, relative to those of the training.
 SHARE = 0.12
@@ -40,16 +41,6 @@ _LOOKS = 2
 _FASTER = 6.0
 # The speed of the last so many stretches of the history is that of the last part.
 _LAST_STRETCHES = 10
-
-
-@dataclass(frozen=True)
-class LastPart:
-    """What `train_on_all` has done. All fields can be stored as JSON."""
-
-    steps: int = 0
-    photos: int = 0  # their number
-    left_out: int = 0  # the number of photos that the scene does not explain
-    why_not: Message | None = None  # why there was no last part; None if there was one
 
 
 def train_on_all(

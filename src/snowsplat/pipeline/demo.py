@@ -11,9 +11,9 @@ from torch import Tensor
 
 from snowsplat.data.colmap.model import posed_camera, read_model
 from snowsplat.pipeline.make import make
-from snowsplat.pipeline.make_result import MakeResult
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.make import MakeOptions
+from snowsplat.pipeline.run.results import MakeResult
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.synthetic import Truth, write_synthetic_photos
 from snowsplat.synthetic.compare_poses import PoseErrors, compare_poses

@@ -9,7 +9,7 @@ from typing import Any
 
 from snowsplat.data.maps.mask_look import doubt_about_files
 from snowsplat.data.readers.projects import advice
-from snowsplat.pipeline.quality import PRESETS
+from snowsplat.pipeline.options.make import PRESETS
 from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import measure_speed, predicted_seconds, survey

@@ -69,7 +69,7 @@ _PACKAGES = (
     _Package("safetensors", "safetensors", "evaluate cannot measure LPIPS"),
 )
 
-_TORCH = "from snowsplat.ops.cuda.inventory import inventory; result = inventory()"
+_TORCH = "from snowsplat.ops.cuda.availability import inventory; result = inventory()"
 _NATIVE = (
     "from snowsplat.util import native_library as n; isa = n.library()[0]; "
     "result = [isa, n.available_isas(), n.default_threads()]"

@@ -16,19 +16,18 @@ from typing import Any
 
 from snowsplat import ops
 from snowsplat.data import Dataset, read_dataset
-from snowsplat.pipeline.all_photos import SHARE, LastPart, train_on_all
+from snowsplat.pipeline.all_photos import SHARE, train_on_all
 from snowsplat.pipeline.given_poses import given_poses
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
-from snowsplat.pipeline.make_result import Figures, MakeResult
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.options.make import MakeOptions
+from snowsplat.pipeline.options.make import PRESETS, MakeOptions, Preset
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_files import write_gaussians
 from snowsplat.pipeline.output.scene_source import load_trained
-from snowsplat.pipeline.quality import PRESETS, Preset
 from snowsplat.pipeline.render import render_images
+from snowsplat.pipeline.run.dataset_check import hash_of_dataset, hash_of_files
 from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.run.photo_stamps import hash_of_dataset, hash_of_files
+from snowsplat.pipeline.run.results import Figures, LastPart, MakeResult
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.project.project import MAKE_RECORD, Project

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from snowsplat.pipeline.quality import PRESETS, Quality
+from snowsplat.pipeline.options.make import PRESETS, Quality
 from snowsplat.sfm.colmap.options import EFFORTS
 from snowsplat.sfm.cost import Photos, Speed, predicted_seconds
 from snowsplat.util.duration import duration

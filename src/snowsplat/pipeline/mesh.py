@@ -16,7 +16,7 @@ from snowsplat.data import ImageLoader, View
 from snowsplat.formats import mesh_files
 from snowsplat.pipeline.confirmed_depth import PHOTO_BYTES, confirm_by_photos
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.options.surface import MeshOptions
+from snowsplat.pipeline.options.scene import MeshOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.mesh import Mesh, compact_mesh, filled_holes, largest_parts, vertex_normals

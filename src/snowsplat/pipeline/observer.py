@@ -12,7 +12,7 @@ from snowsplat.util.messages import Message
 if TYPE_CHECKING:
     import numpy as np
 
-    from snowsplat.pipeline.run.train_result import TrainResult
+    from snowsplat.pipeline.run.results import TrainResult
     from snowsplat.sfm.report.scene_map import PlacedPhoto
     from snowsplat.training.core.progress import Progress
     from snowsplat.util.messages import Message

@@ -21,8 +21,7 @@ from snowsplat.pipeline.videos import level_cameras
 from snowsplat.project.training_folder import RenderedFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.panorama import PanoramaRenderer
-from snowsplat.scene.pixels import to_8bit
-from snowsplat.scene.render import render
+from snowsplat.scene.render import render, to_8bit
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 

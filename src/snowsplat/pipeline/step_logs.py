@@ -18,7 +18,7 @@ from snowsplat.util.files import atomic_path
 
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation
-    from snowsplat.pipeline.run.train_result import TrainResult
+    from snowsplat.pipeline.run.results import TrainResult
     from snowsplat.training.core.progress import Progress
 
 #: The columns of `CsvLog`. The last three are those of the held-out photos, in dB, after an

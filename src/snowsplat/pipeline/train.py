@@ -17,13 +17,11 @@ from snowsplat.ops import device_name
 from snowsplat.pipeline.compute import Compute, open_device
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.train import TrainOptions
-from snowsplat.pipeline.run.camera_check import check_cameras, check_test_photos
-from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
+from snowsplat.pipeline.run.dataset_check import check_cameras, check_test_photos, edited, stamps_of
 from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.run.photo_stamps import edited, stamps_of
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
-from snowsplat.pipeline.run.train_result import TrainResult
-from snowsplat.pipeline.run.training_files import write_beginning
+from snowsplat.pipeline.run.results import TrainResult
+from snowsplat.pipeline.run.training_files import CheckpointMeta, write_beginning
 from snowsplat.pipeline.run.training_run import Request, TrainingRun
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder

@@ -26,8 +26,7 @@ from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.orientation import scene_up
 from snowsplat.scene.panorama import PanoramaRenderer, level_pose
-from snowsplat.scene.pixels import to_8bit
-from snowsplat.scene.render import render
+from snowsplat.scene.render import render, to_8bit
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import remove_temporaries

@@ -16,8 +16,7 @@ from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import load_dataset_of
-from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.run.watchers import PageReply, PageRequest, socket_in
+from snowsplat.pipeline.run.live_page import LivePage, PageReply, PageRequest, socket_in
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.edit import seen_from_dataset

@@ -12,9 +12,8 @@ from typing import Any
 
 import torch
 
-from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera import NEAR, Camera
 from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
-from snowsplat.scene.near_plane import NEAR
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import read_json

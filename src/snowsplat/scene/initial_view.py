@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera import Camera, near_of_overview
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, look_at
-from snowsplat.scene.near_plane import near_of_overview
 
 # Distance of the camera of `overview` from the middle, relative to the radius that it shows.
 _OVERVIEW_DISTANCE = 2.77

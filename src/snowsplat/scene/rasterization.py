@@ -12,10 +12,10 @@ from torch import Tensor
 
 from snowsplat.ops.activated import project_activated, with_centres
 from snowsplat.ops.check import check_size
+from snowsplat.ops.gaussian_parameters import View
 from snowsplat.ops.rasterizer import rasterize
 from snowsplat.ops.reference import JACOBIAN_MARGIN, sh_basis
 from snowsplat.ops.splats import Splats2D, radii_of_conics
-from snowsplat.ops.view import View
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError
 from snowsplat.util.native_layout import TILE

@@ -3,6 +3,8 @@
 The blending weight of a Gaussian in a pixel is w = T α, with the transmittance T in front of it.
 Sums of these weights are gradients: Σ w(p) g(p) is the gradient of Σ c(p) g(p), with the rendered
 image c and any weights g of the pixels p, with respect to the colour of the Gaussian.
+
+The frusta and the surroundings of cameras are for `points_in_frusta` and `points_in_spheres`.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from snowsplat import ops
+from snowsplat.ops import Frusta
 from snowsplat.ops.splats import COLORS
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
@@ -124,3 +127,24 @@ def _by_cameras(gaussians: Gaussians, cameras: Sequence[Camera]) -> Sight:
     found.directions[:, seen] = 3.0 * directions[:, seen] / density[seen]
     found.pixels[seen] = density[seen] / squared[seen]
     return found
+
+
+def frusta_of(cameras: Sequence[Camera], depths: Sequence[tuple[float, float]]) -> Frusta:
+    """The frusta of V cameras, in float64 on their device.
+
+    ``depths``: for each camera the range of depths, world units.
+    """
+    double, device = torch.float64, cameras[0].cam_from_world.device
+    size = [(c.width, c.height) for c in cameras]
+    return Frusta(
+        torch.stack([c.intrinsics.to(device) @ c.cam_from_world.to(double) for c in cameras]),
+        torch.tensor(size, dtype=double, device=device),
+        torch.tensor(depths, dtype=double, device=device),
+        torch.tensor([max(c.fx, c.fy) for c in cameras], dtype=double, device=device),
+    )
+
+
+def spheres_of(cameras: Sequence[Camera], radii: Sequence[float]) -> Tensor:
+    """(C, 4) float32: the centres of cameras, and a radius for each, in world units; on the CPU."""
+    pairs = zip(cameras, radii, strict=True)
+    return torch.tensor([[*c.position.tolist(), radius] for c, radius in pairs])

@@ -15,9 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.pipeline.convert import convert
-from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
-from snowsplat.pipeline.film import moved_film, page_frames, write_keys
-from snowsplat.pipeline.options.publish import PublishOptions
+from snowsplat.pipeline.edit import (
+    OtherScene,
+    edit,
+    moved_film,
+    page_frames,
+    undo_edits,
+    write_keys,
+)
+from snowsplat.pipeline.options.scene import PublishOptions
 from snowsplat.pipeline.publish import PublishResult, publish
 from snowsplat.project.edit_record import PageEdit, edited_file
 from snowsplat.project.page_film import PageFilm

@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.pipeline.describe_photos import describe_photos
-from snowsplat.pipeline.film import film, film_preview
+from snowsplat.pipeline.edit import film, film_preview
 from snowsplat.pipeline.make import make
-from snowsplat.pipeline.make_result import MakeResult
-from snowsplat.pipeline.options.make import MakeOptions
-from snowsplat.pipeline.quality import PRESETS
+from snowsplat.pipeline.options.make import PRESETS, MakeOptions
 from snowsplat.pipeline.run.live_page import LivePage
+from snowsplat.pipeline.run.results import MakeResult
 from snowsplat.project.edit_record import shown_file
 from snowsplat.project.studio_scene import TASKS, StudioScene, version_of
 from snowsplat.sfm.colmap.options import thread_count

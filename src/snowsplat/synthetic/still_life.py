@@ -10,8 +10,7 @@ import math
 import numpy as np
 
 from snowsplat.synthetic import textures as paint
-from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.scene import Scene, SceneObject
+from snowsplat.synthetic.scene import Lamp, Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
 FLOOR = -0.72

@@ -9,9 +9,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera import Camera, near_of_overview
 from snowsplat.scene.geometry import compose_rigid, look_at
-from snowsplat.scene.near_plane import near_of_overview
 from snowsplat.trajectory.focus import (
     DEFAULT_UP,
     focus_of,

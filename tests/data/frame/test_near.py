@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from snowsplat.data.frame.near import near_of
-from snowsplat.scene.camera import Camera
-from snowsplat.scene.near_plane import NEAR, near_of_overview, near_plane
+from snowsplat.scene.camera import NEAR, Camera, near_of_overview, near_plane
 from snowsplat.trajectory import orbit_path
 
 

@@ -10,9 +10,8 @@ import torch
 from snowsplat.extras.globe import glass
 from snowsplat.extras.globe import globe_video as module
 from snowsplat.extras.globe.dimensions import FLOOR
-from snowsplat.extras.globe.flakes import appearance
 from snowsplat.extras.globe.glass import engraving
-from snowsplat.extras.globe.globe_video import GlobeVideo, orbit_camera
+from snowsplat.extras.globe.globe_video import GlobeVideo, appearance, orbit_camera
 from snowsplat.extras.globe.layout import Arrangement
 from snowsplat.extras.globe.physics import FLAKE, Snow
 from snowsplat.scene.gaussians import SH_C0, Gaussians

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from snowsplat.evaluation.metrics import psnr
+from snowsplat.extras.image.compact_file import write_svg
 from snowsplat.extras.image.options import FitOptions
-from snowsplat.extras.image.svg import write_svg
 from snowsplat.util.errors import UserError
 
 from ...browser import Browser

@@ -11,10 +11,8 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
-from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import photograph
-from snowsplat.synthetic.scene import Scene, SceneObject
+from snowsplat.synthetic.photographer import Lens, photograph
+from snowsplat.synthetic.scene import Lamp, Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid
 from snowsplat.synthetic.textures import noise
 

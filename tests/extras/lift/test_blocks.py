@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from snowsplat.extras.lift.blocks import merge_pixels, pixel_blocks
-from snowsplat.extras.lift.edges import find_links
+from snowsplat.extras.lift.surface import find_links
 
 
 def merged(depth, photo, most):

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.extras.lift.colors import with_colors
-from snowsplat.extras.lift.lift import lift
+from snowsplat.extras.lift.lift import lift, with_colors
 from snowsplat.extras.lift.options import LiftOptions
 from snowsplat.scene.render import render
 

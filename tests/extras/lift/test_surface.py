@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from snowsplat.extras.lift.discs import SIGMA, discs, sigma_of_block
-from snowsplat.extras.lift.edges import find_links, resize_depth, snap_to_surfaces
-from snowsplat.extras.lift.surface import surface_of
+from snowsplat.extras.lift.lift import SIGMA, discs, sigma_of_block
+from snowsplat.extras.lift.surface import find_links, resize_depth, snap_to_surfaces, surface_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.render import project

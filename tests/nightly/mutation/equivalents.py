@@ -144,7 +144,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "steps = np.arange(257, dtype=np.float64)",
     ): "no byte is the index of the last one",
     (
-        "trajectory/tour.py",
+        "trajectory/follow.py",
         "order = torch.tensor(tour, dtype=torch.int64)",
         "order = torch.tensor(tour, dtype=None)",
     ): "torch makes int64 of Python's integers",
@@ -154,7 +154,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "quats = torch.cat([quats[:1], quats[1:] / signs[:, None].to(quats.dtype)])",
     ): "signs are 1 or -1",
     (
-        "trajectory/tour.py",
+        "trajectory/follow.py",
         'return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]',
         'return [(int(part), "XXXX") if part.isdecimal() else (-1, part) for part in parts]',
     ): "all numbers have the same second part",
@@ -270,7 +270,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "steps = (steps / steps.mean()).clamp_min(0.046875)",
     ): "any limit of a similar size is suitable",
     (
-        "trajectory/tour.py",
+        "trajectory/follow.py",
         "while count > 2:",
         "while count > 3:",
     ): "of three places, the first tour is already the shortest: it omits the longest step",

@@ -11,7 +11,7 @@ import pycolmap
 from snowsplat.sfm.colmap.database import closing_database, open_database
 from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.synthetic.lens import Lens as PhoneLens
+from snowsplat.synthetic.photographer import Lens as PhoneLens
 
 from ...scenes.lenses import FisheyeLens
 

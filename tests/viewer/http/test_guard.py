@@ -226,7 +226,7 @@ def test_close_ends_websockets():
 def test_the_first_free_port_of_several(monkeypatch):
     with WebServer(early, port=None) as first, WebServer(early, port=None) as second:
         assert 8080 <= first.port < second.port < 8100
-    monkeypatch.setattr("snowsplat.viewer.http.listen._TRIED", 0)
+    monkeypatch.setattr("snowsplat.viewer.hosts._TRIED", 0)
     with pytest.raises(Exception, match="are in use"):
         WebServer(early, port=None)
 

@@ -20,7 +20,7 @@ import pytest
 
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.viewer.http.listen import listen
+from snowsplat.viewer.hosts import listen
 
 from ...browser import Browser, Page
 from ...fork_server import popen

@@ -10,7 +10,7 @@ from snowsplat.data import load_dataset
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.viewer.live.curves import Curve, SampledPsnr
+from snowsplat.viewer.live.training import Curve, SampledPsnr
 
 
 def test_a_curve_has_few_points_and_correct_means():

@@ -7,7 +7,7 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, quat_from_rotation
-from snowsplat.viewer.live.display import PhotoRectangle, View, fit
+from snowsplat.viewer.live.pictures import PhotoRectangle, View, fit
 
 
 def pose(fov: float = 1.0, width: int = 640, height: int = 480) -> View:

@@ -15,8 +15,7 @@ from snowsplat.data import Dataset, load_dataset
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.settings.config import TrainConfig
-from snowsplat.viewer.live.curves import SampledPsnr
-from snowsplat.viewer.live.training import TrainingViewer
+from snowsplat.viewer.live.training import SampledPsnr, TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer
 
 from .. import clients

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from snowsplat.viewer.live.display import Display, View
-from snowsplat.viewer.live.messages import Key, Share, Shown, Thumbnails, Training, parse, to_json
+from snowsplat.viewer.live.browser import Key, Share, Shown, Thumbnails, Training, parse, to_json
+from snowsplat.viewer.live.pictures import Display, View
 
 from .. import clients
 

@@ -9,8 +9,7 @@ import torch
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import SH_C0, Gaussians
 from snowsplat.scene.render import render
-from snowsplat.viewer.live.display import Display, PhotoRectangle
-from snowsplat.viewer.live.pictures import DEPTH, HEAT, Photo, draw
+from snowsplat.viewer.live.pictures import DEPTH, HEAT, Display, Photo, PhotoRectangle, draw
 
 WIDTH, HEIGHT = 90, 60
 CAMERA = Camera(WIDTH, HEIGHT, 80.0, 80.0, 45.0, 30.0, torch.eye(3, 4, dtype=torch.float64))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from snowsplat.scene.camera import Camera
-from snowsplat.viewer.live.display import Display, View
+from snowsplat.viewer.live.pictures import Display, View
 from snowsplat.viewer.live.session import IDLE_SHARE, STILL, PhotoView, Session
 
 from ...waiting import wait_until

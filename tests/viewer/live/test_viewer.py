@@ -17,8 +17,7 @@ from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.messages import Message, message
-from snowsplat.viewer.live.curves import SampledPsnr
-from snowsplat.viewer.live.training import TrainingViewer
+from snowsplat.viewer.live.training import SampledPsnr, TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
 from ...training.test_unit import scaled

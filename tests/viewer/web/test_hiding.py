@@ -13,9 +13,8 @@ from snowsplat.project.site_folder import SiteFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.viewer.web.hiding import hiding_of
-from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description
-from snowsplat.viewer.web.publication import write_site
+from snowsplat.viewer.web.publication import write_html, write_site
 from snowsplat.viewer.web.scene import ReadyScene, ready
 
 from ...browser import Browser, Page

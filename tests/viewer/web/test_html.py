@@ -12,7 +12,7 @@ from snowsplat.pipeline.output.scene_files import read_gaussians, write_gaussian
 from snowsplat.scene.gaussians import SH_C0, Gaussians
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.web import html
+from snowsplat.viewer.web import publication
 from snowsplat.viewer.web.scene import ready
 
 from ...browser import Browser
@@ -68,7 +68,7 @@ def test_the_page_is_listed_among_the_formats_to_write(tmp_path):
 def test_scenes_without_a_page(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="has no Gaussians"):
         write_gaussians(tmp_path / "scene.html", three_balls().select(torch.zeros(0).long()))
-    monkeypatch.setattr(html, "_LARGEST", 100)
+    monkeypatch.setattr(publication, "_LARGEST", 100)
     with pytest.raises(UserError, match="too many for one page; decimate"):
         write_gaussians(tmp_path / "scene.html", three_balls())
     assert not list(tmp_path.iterdir())
@@ -77,7 +77,7 @@ def test_scenes_without_a_page(tmp_path, monkeypatch):
 @pytest.mark.browser
 def test_a_real_browser_opens_it_from_disk(tmp_path):
     path = tmp_path / "scene.html"
-    html.write_html(path, ready(three_balls(), ())._replace(start=FRONT))
+    publication.write_html(path, ready(three_balls(), ())._replace(start=FRONT))
     with Browser(400, 300) as browser:
         page = browser.open(f"{path.as_uri()}?webgl&noui")
         page.wait_for("!!window.app", 60)

@@ -15,8 +15,8 @@ import torch
 from snowsplat.data import Points
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description, view_numbers
+from snowsplat.viewer.web.publication import write_html
 from snowsplat.viewer.web.scene import ReadyScene, ready
 from snowsplat.viewer.web.stops import stops_of
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import scene_extent
 from snowsplat.data.frame.bounds import scene_bounds
-from snowsplat.scene.camera import Camera
-from snowsplat.scene.near_plane import near_plane
+from snowsplat.scene.camera import Camera, near_plane
 from snowsplat.util.process import single_threaded
 
 # At most this number of cameras is used, evenly chosen, to limit the time; of the points about this

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from snowsplat.extras.globe import dimensions, flakes, glass, physics
+from snowsplat.extras.globe import dimensions, glass, globe_video, physics
 from snowsplat.extras.globe import globe_video as video
 from snowsplat.extras.globe.layout import Arrangement
 from snowsplat.ops import reference
@@ -88,7 +88,7 @@ def glsl_constants(antialiased: bool) -> str:
     modules: dict[Any, tuple[str, ...]] = {
         dimensions: ("FLOOR", "FLOOR_RADIUS", "BLEND", "GROUND"),
         glass: ("PLATE_Y", "FRESNEL"),
-        flakes: ("BRIGHTER", "WHITE", "OPAQUE"),
+        globe_video: ("BRIGHTER", "WHITE", "OPAQUE"),
         reference: ("C1",),
     }
     numbers = {name: getattr(m, name) for m, names in modules.items() for name in names}

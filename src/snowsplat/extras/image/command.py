@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from snowsplat.cli.command import JsonCommand
+from snowsplat.cli.command import JsonCommand, print_message
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.print_message import print_message
 from snowsplat.extras.image.options import FitOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common

@@ -11,23 +11,35 @@
 All numbers are little-endian. The value of level q is low + step · q, in float32, so that reading a
 file always gives the same Gaussians. The order of additive Gaussians has no effect: they are sorted
 along a Z-order curve, and the levels of x and y are stored as differences modulo 2¹⁶.
+
+`write_svg` writes them as a picture in the format SVG: one ellipse with a radial gradient for each.
 """
 
 from __future__ import annotations
 
 import lzma
+import math
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import torch
 
-from snowsplat.extras.image.model import ANGLE, OPACITY_LOGIT, ImageGaussians, column_count
+from snowsplat.extras.image.model import (
+    ANGLE,
+    COLORS,
+    LOG_SIGMAS,
+    MEANS,
+    OPACITY_LOGIT,
+    ImageGaussians,
+    column_count,
+)
 from snowsplat.extras.image.options import MOST_GAUSSIANS, Blending
 from snowsplat.util.errors import Problem, UserError
-from snowsplat.util.files import reading, write_bytes
+from snowsplat.util.files import reading, write_bytes, write_text
 
 SUFFIX = ".gimg"
 _MAGIC = b"GIMG"
@@ -43,6 +55,10 @@ _LARGEST_LOGIT = 6.0  # opacity 0.9975; the rasterizer limits α to 0.99
 # The settings for the smallest files that were measured. Raw data: the checksum is our own.
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 9, "dict_size": 1 << 22, "lc": 0, "lp": 0, "pb": 0}]
 _MOST_PIXELS = 1 << 26
+# The ellipse ends where the opacity of a Gaussian with opacity 1 is 1/255, as in the rasterizer.
+_CUTOFF = math.sqrt(2 * math.log(255))  # σ
+# Stops of a gradient. Between two of them, the opacity is linear.
+_STOPS = 9
 
 
 def write_compact(path: Path, gaussians: ImageGaussians) -> ImageGaussians:
@@ -163,3 +179,56 @@ def _z_order(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         for shift, values in enumerate((x, y)):
             code |= (values.astype(np.uint64) >> np.uint64(bit) & one) << np.uint64(2 * bit + shift)
     return code
+
+
+def write_svg(path: Path, gaussians: ImageGaussians) -> None:
+    """Write the Gaussians as an SVG file, atomically.
+
+    SVG composites shapes from back to front, which is front-to-back blending in the opposite order.
+    Colours are limited to 0..1 and rounded to 8 bits, and a gradient is piecewise linear, so the
+    picture differs slightly from `ImageGaussians.render`.
+
+    Raises:
+        UserError: the Gaussians are additive. SVG has no negative colours.
+        OSError: the file cannot be written.
+    """
+    if gaussians.blending == "additive":
+        raise UserError("additive Gaussians have no SVG; fit the photo with blending front-to-back")
+    write_text(path, "".join(_lines(gaussians)))
+
+
+@torch.no_grad()
+def _lines(gaussians: ImageGaussians) -> Iterator[str]:
+    width, height = gaussians.width, gaussians.height
+    yield (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        f'width="{width}" height="{height}">\n'
+        # A gradient inherits its colour from the attribute `color`.
+        "<style>stop{stop-color:currentColor}</style>\n"
+        f'<rect width="{width}" height="{height}" fill="{_hex(gaussians.background.numpy())}"/>\n'
+    )
+    rows = gaussians.rows.flip(0).double()
+    means, angles = rows[:, MEANS].numpy(), rows[:, ANGLE].rad2deg().numpy()
+    radii = _CUTOFF * rows[:, LOG_SIGMAS].exp().numpy()
+    colors = rows[:, COLORS].numpy()
+    opacities = torch.sigmoid(rows[:, OPACITY_LOGIT]).numpy()
+    offsets = np.linspace(0, 1, _STOPS)
+    falloff = np.exp(-0.5 * (_CUTOFF * offsets) ** 2)
+    falloff[-1] = 0.0
+    for i in range(len(rows)):
+        stops = "".join(
+            f'<stop offset="{offset:.3g}" stop-opacity="{opacities[i] * weight:.3g}"/>'
+            for offset, weight in zip(offsets, falloff, strict=True)
+        )
+        (x, y), (rx, ry) = means[i], radii[i]
+        yield (
+            f'<radialGradient id="g{i}" color="{_hex(colors[i])}">{stops}</radialGradient>\n'
+            f'<ellipse rx="{rx:.2f}" ry="{ry:.2f}" fill="url(#g{i})" '
+            f'transform="translate({x:.2f} {y:.2f}) rotate({angles[i] % 180:.1f})"/>\n'
+        )
+    yield "</svg>\n"
+
+
+def _hex(color: np.ndarray) -> str:
+    """(3,) in 0..1 as #rrggbb."""
+    return "#" + bytes(np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)).hex()

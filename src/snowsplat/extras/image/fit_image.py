@@ -13,16 +13,15 @@ from torch import Tensor
 
 from snowsplat.data.photos.decode import ImageSource, load_image, read_header
 from snowsplat.evaluation.metrics import compare
-from snowsplat.extras.image.compact_file import read_compact, write_compact
+from snowsplat.extras.image.compact_file import read_compact, write_compact, write_svg
 from snowsplat.extras.image.fit import Fitter
 from snowsplat.extras.image.image_report import Fitted, Moment, recorded_steps, write_image_report
 from snowsplat.extras.image.model import ImageGaussians
 from snowsplat.extras.image.options import FitOptions
-from snowsplat.extras.image.svg import write_svg
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.image_files import write_png
-from snowsplat.scene.pixels import to_8bit
+from snowsplat.scene.render import to_8bit
 from snowsplat.training.core.progress import Progress
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import UserError

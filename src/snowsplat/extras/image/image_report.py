@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.extras.image.model import COLORS, LOG_SIGMAS, OPACITY_LOGIT, ImageGaussians
-from snowsplat.scene.pixels import to_8bit
+from snowsplat.scene.render import to_8bit
 from snowsplat.util import charts
 from snowsplat.util.files import write_text
 from snowsplat.util.html import picture, render_page

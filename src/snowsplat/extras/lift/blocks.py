@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from snowsplat.extras.lift.edges import Links
+from snowsplat.extras.lift.surface import Links
 
 # Width in pixels of the largest block, a power of two.
 _LARGEST = 16

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from snowsplat.cli.command import JsonCommand
-from snowsplat.cli.next_steps import see_and_share
+from snowsplat.cli.command import JsonCommand, print_message, see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.print_message import print_message
 from snowsplat.extras.lift.options import DepthSource, LiftOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common

@@ -17,17 +17,16 @@ from snowsplat.data.maps.depth_alignment import Alignment
 from snowsplat.data.maps.map_files import read_depth_file, to_z
 from snowsplat.evaluation.metrics import Evaluation, compare
 from snowsplat.extras.lift.depth_model import estimate_depth
-from snowsplat.extras.lift.edges import resize_depth
 from snowsplat.extras.lift.lift import lift
 from snowsplat.extras.lift.options import DepthSource, LiftOptions
+from snowsplat.extras.lift.surface import resize_depth
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output.image_files import depth_in_color, write_png
 from snowsplat.pipeline.run.training_files import write_beginning, write_scene
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.pixels import to_8bit
-from snowsplat.scene.render import render
+from snowsplat.scene.render import render, to_8bit
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, decode, read_header
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.trajectory.orbit import swing_path

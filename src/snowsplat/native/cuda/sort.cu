@@ -1,6 +1,6 @@
 // Prefix sums and a radix sort of any length, used by the other operations. No block waits for
 // another block: each step that needs the results of all blocks is a separate kernel (see
-// ops/cuda/sorting.py).
+// ops/cuda/tiling.py).
 //
 //   scan_sums, scan_of_sums, scan_apply   an exclusive prefix sum
 //   sort_count, sort_offsets, sort_scatter   one pass of the sort, by one digit of at most 8 bits;

@@ -6,16 +6,26 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
+from torch import Tensor
 
 from snowsplat.ops.cuda import driver
-from snowsplat.ops.cuda.kernels import KERNELS, SWEEP_EDGE, Kernel, Run
-from snowsplat.ops.cuda.nearest_neighbours import neighbours
-from snowsplat.ops.cuda.photometric import photometric
-from snowsplat.ops.cuda.tiling import splats_sort, tiles_count, tiles_fill, workspace_bytes
+from snowsplat.ops.cuda.kernels import KERNELS, NEIGHBOUR_LISTS, SWEEP_EDGE, Kernel, Run
+from snowsplat.ops.cuda.tiling import (
+    sort_pairs,
+    splats_sort,
+    tiles_count,
+    tiles_fill,
+    workspace_bytes,
+)
 from snowsplat.util.native_layout import POSE_SUMS, SEGMENT, Fields
 
 Execute = Callable[[Kernel, str, int, Fields], None]
 """Runs a kernel. Arguments: the kernel, its full name, the number of blocks, the parameters."""
+_TILE_WIDTH = 32
+_TILE_HEIGHT = {"": 24, "_f64": 12}
+_MAPS_BYTES = 32 << 20  # maximum size of the maps of derivatives, if at least one channel fits
+_CHUNK = 32  # points of a chunk; also chunks of a group
+_CODE_BITS = 63
 
 
 def launch(name: str, fields: Fields) -> int:
@@ -90,6 +100,75 @@ def _rasterize_bwd(run: Run, suffix: str, p: Fields) -> int:
 def _plane_sweep(run: Run, suffix: str, p: Fields) -> int:
     blocks = -(-p["width"] // SWEEP_EDGE) * -(-p["height"] // SWEEP_EDGE)
     run("plane_sweep" + suffix, p, blocks)
+    return 0
+
+
+def photometric(target_suffix: str, run: Run, suffix: str, p: Fields) -> int:
+    """``target_suffix``: "_u8" for a target of bytes, or ""."""
+    channels, width, height = p["n"], p["width"], p["height"]
+    image, target, grad = p["image"], p["target"], p["grad"]
+    tiles = -(-width // _TILE_WIDTH) * -(-height // _TILE_HEIGHT[suffix])  # of a channel
+    device, dtype = image.device, image.dtype
+    sums = torch.empty(channels * tiles, 3, dtype=torch.float64, device=device)
+    values = channels * width * height
+    at_once = channels
+    if grad is not None:
+        size = 3 * width * height * image.element_size()
+        at_once = max(1, min(channels, _MAPS_BYTES // size))
+        maps = torch.empty(at_once * 3 * width * height, dtype=dtype, device=device)
+    for first in range(0, channels, at_once):
+        last = min(first + at_once, channels)
+        blocks = (last - first) * tiles
+        inputs = {
+            "n": last - first,
+            "width": width,
+            "height": height,
+            "image": image[first:last],
+            "target": target[first:last],
+            "maps": None if grad is None else maps,
+        }
+        similarity = {**inputs, "sums": sums[first * tiles :]}
+        run(f"photometric_similarity{target_suffix}{suffix}", similarity, blocks)
+        if grad is not None:
+            names = ("l1_weight", "ssim_weight", "huber_weight")
+            weights = {name: p[name] / values for name in names}
+            gradient = {**inputs, **weights, "grad": grad[first:last]}
+            run(f"photometric_gradient{target_suffix}{suffix}", gradient, blocks)
+    means = {"n": channels * tiles, "sums": sums, "values": values, "means": p["means"]}
+    run("photometric_means", means, 1)
+    return 0
+
+
+def neighbours(run: Run, suffix: str, p: Fields) -> int:
+    n, points = p["n"], p["points"]
+    if n == 0:
+        return 0
+
+    def empty(*shape: int, dtype: torch.dtype = points.dtype) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=points.device)
+
+    low, high = torch.aminmax(points, dim=0)
+    codes, order = empty(n, dtype=torch.int64), empty(n, dtype=torch.int32)
+    chunks = -(-n // _CHUNK)
+    groups = -(-chunks // _CHUNK)
+    ordered, chunk_boxes, group_boxes = empty(n, 3), empty(chunks, 8), empty(groups, 8)
+    run(
+        "neighbours_codes" + suffix,
+        {"n": n, "points": points, "low": low, "high": high, "codes": codes},
+    )
+    others = torch.empty_like(codes), torch.empty_like(order)
+    _, order = sort_pairs(run, n, codes, others[0], order, others[1], (0, _CODE_BITS), rows=True)
+    run(
+        "neighbours_chunks" + suffix,
+        {"n": n, "points": points, "order": order, "ordered": ordered, "boxes": chunk_boxes},
+    )
+    run(
+        "neighbours_groups" + suffix,
+        {"n": chunks, "chunk_boxes": chunk_boxes, "boxes": group_boxes},
+    )
+    search = f"neighbours_of_{next(size for size in NEIGHBOUR_LISTS if size >= p['k'])}"
+    boxes = {"chunk_boxes": chunk_boxes, "group_boxes": group_boxes}
+    run(search + suffix, {**p, "points": ordered, "order": order, **boxes})
     return 0
 
 

@@ -29,7 +29,7 @@ from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import TrainingFolder
-from snowsplat.scene.pixels import to_8bit
+from snowsplat.scene.render import to_8bit
 from snowsplat.training.core.history import History
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json

@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.scene.pixels import in_colors
-from snowsplat.trajectory.spherical_metadata import panorama_xmp
+from snowsplat.scene.render import in_colors
+from snowsplat.trajectory.video_file import panorama_xmp
 from snowsplat.util.files import atomic_path
 
 # Anchors of a colour map from far (0) to near (1) of increasing lightness: violet to yellow.

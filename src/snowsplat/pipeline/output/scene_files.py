@@ -41,7 +41,7 @@ __all__ = [
 
 
 def _write_html(path: Path, gaussians: GaussianArrays) -> None:
-    from snowsplat.viewer.web.html import write_html
+    from snowsplat.viewer.web.publication import write_html
     from snowsplat.viewer.web.scene import ready
 
     write_html(path, ready(gaussians.to_gaussians(), ()))

@@ -14,14 +14,17 @@ from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
-from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
-from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.run.photo_stamps import Stamp
+from snowsplat.pipeline.run.dataset_check import Stamp
+from snowsplat.pipeline.run.live_page import LivePage, Watchers
 from snowsplat.pipeline.run.processes import Collective
 from snowsplat.pipeline.run.refined_cameras import write_refined
-from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
-from snowsplat.pipeline.run.training_files import write_beginning, write_cameras, write_scene
-from snowsplat.pipeline.run.watchers import Watchers
+from snowsplat.pipeline.run.results import TrainingStopped, TrainResult
+from snowsplat.pipeline.run.training_files import (
+    CheckpointMeta,
+    write_beginning,
+    write_cameras,
+    write_scene,
+)
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import (

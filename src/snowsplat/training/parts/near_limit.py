@@ -31,8 +31,8 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.ops import Frusta
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.frusta import frusta_of, spheres_of
 from snowsplat.scene.geometry import invert_rigid
+from snowsplat.scene.sight import frusta_of, spheres_of
 from snowsplat.training.parts.part import REMOVED, Part
 from snowsplat.training.starts.photos import in_threads
 from snowsplat.training.starts.source_views import source_views

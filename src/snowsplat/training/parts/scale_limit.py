@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.scene.frusta import spheres_of
+from snowsplat.scene.sight import spheres_of
 from snowsplat.training.parts.part import Part
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ import torch
 
 from snowsplat import ops
 from snowsplat.ops import Frusta
-from snowsplat.scene.frusta import frusta_of
+from snowsplat.scene.sight import frusta_of
 from snowsplat.training.parts.part import Part
 
 if TYPE_CHECKING:

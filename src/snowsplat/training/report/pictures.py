@@ -13,7 +13,7 @@ from snowsplat.data import ImageLoader, View
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
 from snowsplat.evaluation.renderings import Rendering, renderings
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.pixels import in_colors, to_8bit
+from snowsplat.scene.render import in_colors, to_8bit
 from snowsplat.util.messages import Message, message
 
 #: Number of views that are shown, of those with the lowest and the highest PSNR.

@@ -19,14 +19,13 @@ from starlette.types import ASGIApp
 from uvicorn.config import Config
 from uvicorn.server import ServerState
 
-from snowsplat.viewer.hosts import ANY_HOST, KnownHosts
+from snowsplat.viewer.hosts import ANY_HOST, BACKLOG, KnownHosts, listen
 from snowsplat.viewer.http.guard import (
     IDLE_SECONDS,
     MESSAGE_SIZE,
     Guard,
     HttpConnection,
 )
-from snowsplat.viewer.http.listen import BACKLOG, listen
 
 _log = logging.getLogger(__name__)
 

@@ -20,8 +20,7 @@ from snowsplat.data import View
 from snowsplat.data.photos.decode import load_image
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.live.display import PhotoRectangle, fit
-from snowsplat.viewer.live.pictures import Photo
+from snowsplat.viewer.live.pictures import Photo, PhotoRectangle, fit
 from snowsplat.viewer.live.session import PhotoView, Session
 
 _LENGTH = 0.6  # length of a frustum, relative to the distance of neighbouring cameras

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from snowsplat.scene.camera import Camera
-from snowsplat.viewer.live.display import Display, View, fit
+from snowsplat.viewer.live.pictures import Display, View, fit
 
 STILL = 0.2  # seconds without motion after which a camera counts as still
 # While the camera moves, images are made so small that rendering takes at most this many seconds.

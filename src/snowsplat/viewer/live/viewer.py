@@ -24,9 +24,8 @@ from snowsplat.util import messages
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.server import WebServer
 from snowsplat.viewer.http.static import FileOnDisk, Served, ServedFile, content_type, static_app
-from snowsplat.viewer.live.browser import Browser
-from snowsplat.viewer.live.display import Display, View
-from snowsplat.viewer.live.messages import (
+from snowsplat.viewer.live.browser import (
+    Browser,
     Key,
     Message,
     Share,
@@ -37,7 +36,7 @@ from snowsplat.viewer.live.messages import (
 )
 from snowsplat.viewer.live.page_files import FILES, INDEX, POLICY
 from snowsplat.viewer.live.photos import Photos, fitted_photo, jpeg
-from snowsplat.viewer.live.pictures import draw
+from snowsplat.viewer.live.pictures import Display, View, draw
 from snowsplat.viewer.live.session import RenderRequest, Session
 from snowsplat.viewer.live.time_limit import ServerTimeLimit
 

@@ -1,7 +1,13 @@
-"""A static web site that shows a scene: any web host can serve its folder."""
+"""A static web site that shows a scene: any web host can serve its folder.
+
+`write_html` writes the viewer and the scene in a single HTML file. It can be opened from disk in
+any browser with WebGL 2, and makes no network requests. The scene is embedded as a SOG file in
+base64, the same as that of a published site. Pages are written, but cannot be read.
+"""
 
 from __future__ import annotations
 
+import base64
 import html
 import io
 from collections.abc import Callable, Mapping
@@ -12,19 +18,41 @@ from PIL import Image
 
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.lod import INDEX
-from snowsplat.formats.sog import write_sog
+from snowsplat.formats.sog import sog_bytes, write_sog
 from snowsplat.project.site_folder import PAGE, POSTER, SCENE, SiteFolder
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.pixels import to_8bit
-from snowsplat.scene.render import render
+from snowsplat.scene.render import render, to_8bit
+from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_bytes, write_text
 from snowsplat.viewer.http.static import Served, served
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import PICTURES, ReadyScene
-from snowsplat.viewer.web.viewer_page import asset, content_policy, page
+from snowsplat.viewer.web.viewer_page import asset, content_policy, page, whole_page
 
 #: The size that services recommend for the picture of a link (Open Graph).
 POSTER_SIZE = (1200, 630)
+#: Largest scene in bytes. Browsers support strings of about 500 million characters, and base64
+#: makes 4 characters of 3 bytes.
+_LARGEST = 360_000_000
+# The scene is passed to the viewer as a blob URL, because browsers limit the length of data URLs.
+_SCENE = """        <script type="text/plain" id="scene">{scene}</script>
+        <script>
+            const scene = document.getElementById('scene');
+            const base64 = scene.textContent;
+            scene.remove();
+            const parts = [];
+            for (let at = 0; at < base64.length; at += 1 << 22) {{
+                const text = atob(base64.slice(at, at + (1 << 22)));
+                const bytes = new Uint8Array(text.length);
+                for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+                parts.push(bytes);
+            }}
+            const bootstrap = document.getElementById('sse-bootstrap');
+            const contentUrl = URL.createObjectURL(new Blob(parts));
+            bootstrap.textContent = JSON.stringify({{
+                ...JSON.parse(bootstrap.textContent), contentUrl
+            }});
+        </script>"""
 
 
 def write_one_file(folder: Path, gaussians: Gaussians) -> str:
@@ -121,3 +149,32 @@ def _poster(scene: ReadyScene) -> bytes:
     file = io.BytesIO()
     Image.fromarray(to_8bit(image)).save(file, "JPEG", quality=88)
     return file.getvalue()
+
+
+def write_html(path: Path | str, scene: ReadyScene, about: Description | None = None) -> None:
+    """Write the page of a scene atomically; ``about`` is by default the name of the file.
+
+    Raises:
+        UserError: no Gaussians, or too many for one page.
+        OSError: the folder is missing or not writable, or the disk is full.
+    """
+    path = Path(path)
+    about = about or Description(path.stem)
+    count = len(scene.gaussians)
+    if not count:
+        raise UserError("{path}: the scene has no Gaussians; a page needs at least one", path=path)
+    content = sog_bytes(path, GaussianArrays.from_gaussians(scene.gaussians))
+    if len(content) > _LARGEST:
+        raise UserError(
+            "{path}: {count:,} Gaussians are too many for one page; decimate them, or drop SH "
+            "degrees",
+            path=path,
+            count=count,
+        )
+    pictures = f"data:image/webp;base64,{_base64(scene.stops.pictures)}"
+    bootstrap = scene.bootstrap(about, pictures) | {"contentFilename": "scene.sog"}
+    write_text(path, whole_page(about.title, bootstrap, _SCENE.format(scene=_base64(content))))
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")

@@ -22,8 +22,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import transform_points
 from snowsplat.scene.initial_view import InitialView, bounding_sphere, view_of_camera
-from snowsplat.scene.pixels import to_8bit
-from snowsplat.scene.render import render
+from snowsplat.scene.render import render, to_8bit
 from snowsplat.trajectory.focus import focus_of, positions_of
 
 #: Largest number of stops; the pictures of so many fit on a small page.

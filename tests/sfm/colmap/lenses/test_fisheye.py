@@ -18,7 +18,7 @@ from snowsplat.sfm.colmap.options import CAMERA_MODELS
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
-from snowsplat.synthetic.lens import Lens as PhoneLens
+from snowsplat.synthetic.photographer import Lens as PhoneLens
 
 from ....scenes.lenses import FisheyeLens
 from .. import walks

@@ -1,12 +1,13 @@
-"""`Edits`: how `convert` changes a scene."""
+"""`Edits`, `MeshOptions`, `PublishOptions`: options of what is made of a finished scene."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 from snowsplat.util.errors import SettingError
-from snowsplat.util.settings import Settings, setting
+from snowsplat.util.settings import Settings, setting, switch
 
 Vector = tuple[float, float, float]
 Box = tuple[float, float, float, float, float, float]
@@ -93,3 +94,79 @@ class Edits(Settings):
             raise SettingError("crop", "the corners are swapped; give the lower corner first")
         if self.decimate is not None and file_size(self.decimate) is None:
             gaussians_to_keep(self.decimate, 0)
+
+
+def _length(help: str, default: str) -> float | None:
+    allowed = "a number above 0"
+    return setting(None, help, default, above=0.0, allowed=allowed, metavar="LENGTH")
+
+
+def _installed(triangles: int) -> str | None:
+    package = "needs the package fast-simplification: pip install 'snowsplat[mesh]'"
+    return None if find_spec("fast_simplification") else f"{package}; or leave it out"
+
+
+@dataclass(frozen=True)
+class MeshOptions(Settings):
+    """How surfaces become triangles. Lengths are in world units.
+
+    Attributes:
+        voxel: default: more than 2 widths of a pixel if the voxels would not fit into memory.
+    """
+
+    voxel: float | None = _length(
+        "Side of the voxels in which the depth maps are fused: the smallest detail.",
+        "2 pixels of the photos",
+    )
+    far: float | None = _length(
+        "Leave out what is farther than this from every camera.", "3 times the median depth"
+    )
+    parts: float = setting(
+        0.01,
+        "Leave out connected parts that are smaller than this share of the largest one.",
+        least=0.0,
+        most=1.0,
+        metavar="SHARE",
+    )
+    triangles: int | None = setting(
+        None,
+        "Simplify the mesh to about this number: 5000 for collisions in a game.",
+        "all",
+        least=4,
+        check=_installed,
+        metavar="N",
+    )
+    fill_holes: bool = switch("Close holes with flat triangles, as 3D printing needs it.")
+
+
+def _problem(url: str) -> str | None:
+    known = not url or re.fullmatch(r"https?://[^\s\"<>?#]+", url)
+    return None if known else "is no address; use e.g. https://host/garden/"
+
+
+@dataclass(frozen=True)
+class PublishOptions(Settings):
+    """Options of a published scene.
+
+    Attributes:
+        title: None: the name of the scene.
+        licence: such as "CC BY 4.0".
+        for_editing: the page is not to be looked at: it has all Gaussians, even of a large scene,
+            without what their colours owe to the direction of view.
+
+    Raises:
+        UserError: the address is not one.
+    """
+
+    title: str | None = setting(
+        None, "The name of the scene on the page.", "the name of the scene", metavar="TEXT"
+    )
+    licence: str = setting("", "The licence of the scene.", "not stated", metavar="TEXT")
+    url: str = setting(
+        "",
+        "The address of the folder on the web, for the picture in previews of links.",
+        "not known",
+        check=_problem,
+        metavar="URL",
+    )
+    for_editing: bool = False
