@@ -9,15 +9,13 @@ from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap import reconstruct
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.lens import Lens
-from snowsplat.sfm.colmap.reconstruct import PoseEstimation, best_attempt
+from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
 
 
-def attempt(registered, agreement=0.99, misfit=1.0, doubts=()):
-    return SimpleNamespace(
-        registered=registered, agreement=agreement, misfit=misfit, doubts=doubts, models=[]
-    )
+def attempt(registered, agreement=0.99, doubts=()):
+    return SimpleNamespace(registered=registered, agreement=agreement, doubts=doubts, models=[])
 
 
 @pytest.fixture
@@ -54,19 +52,13 @@ def test_a_bent_model_is_not_good(job, agreement, good):
     assert job._good == good
 
 
-def test_the_attempt_with_the_highest_score_is_used():
-    few, many = attempt(9), attempt(10)
-    assert best_attempt([few, many], [5000.0, 4000.0]) is few
-    assert best_attempt([few, many], [-5.0, -4.0]) is many
-
-
-def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches():
-    """A few photos of a flat field: with a wrong focal length, the poses are bent."""
-    bent = attempt(5, misfit=1.10e-3, doubts=["the focal length in EXIF does not agree"])
-    other = attempt(5, misfit=1.00e-3)
-    assert best_attempt([bent, other], [1010.0, 1000.0]) is other
-    other.misfit = 1.2e-3  # the photos contradict the focal length in EXIF
-    assert best_attempt([bent, other], [1010.0, 1000.0]) is bent
+def test_the_attempt_with_the_highest_score_is_used(job):
+    few, many = job.attempts = [attempt(9), attempt(10)]
+    few.models = many.models = ["a model"]
+    job.pairs, job.scores = [], [(few, SimpleNamespace(total=5)), (many, SimpleNamespace(total=4))]
+    assert job._best() is few
+    job.scores[0][1].total = 3
+    assert job._best() is many
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from snowsplat.sfm.colmap.database import (
     set_cameras,
 )
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress, extract_features
-from snowsplat.sfm.colmap.lenses.lens import Lens, misfit, settle_lens, with_all_parameters
+from snowsplat.sfm.colmap.lenses.lens import Lens, settle_lens, with_all_parameters
 from snowsplat.sfm.colmap.mapping.mapping import Mapping, usable_models
 from snowsplat.sfm.colmap.options import Effort, detection_size
 from snowsplat.sfm.colmap.pairs.choice import PairChoice, choose_pairs
@@ -77,11 +77,6 @@ class Attempt:
     @property
     def registered(self) -> int:
         return self.models[0].num_reg_images() if self.models else 0
-
-    @property
-    def misfit(self) -> float:
-        """`lens.misfit` of the first model."""
-        return misfit(self.models[0]) if self.models else float("inf")
 
 
 @dataclass

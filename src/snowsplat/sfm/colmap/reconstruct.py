@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,13 +38,13 @@ from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses import camera_groups
 from snowsplat.sfm.colmap.lenses.fisheye import LensEvidence, lens_evidence
 from snowsplat.sfm.colmap.lenses.lens import (
-    EQUAL_ERROR,
     Lens,
     camera_ids,
     circle_focals,
     exif_focals,
     focals_by_camera,
 )
+from snowsplat.sfm.colmap.lenses.posterior import estimate_lenses
 from snowsplat.sfm.colmap.mapping.mapping import write_models
 from snowsplat.sfm.colmap.options import Effort, SfmResult
 from snowsplat.sfm.colmap.pairs.choice import PairChoice
@@ -57,8 +56,6 @@ _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
 # The expected time from the start of the job to the end of the next attempt, divided by the time
 # from the start of the job until now.
 _NEXT_ATTEMPT = 3.0
-# A model with a lens in doubt is chosen only if its score is this many times that of one without.
-_IN_DOUBT = 2.0
 # Each attempt with several focal lengths has better estimates of them than the one before.
 _ZOOM_ATTEMPTS = 3
 
@@ -111,7 +108,8 @@ class PoseEstimation:
             raise error
         self.runner.progress.show_poses(best.models[0], True)
         choice, image_size = self._describe_choice(best), best.matched.effort.image_size
-        models = [best.mapping.complete(model, image_size) for model in best.models]
+        exif = exif_focals(self.photos) if best.lens.exif else {}
+        models = [best.mapping.complete(model, image_size, exif) for model in best.models]
         for model in models:
             model.extract_colors_for_all_images(self.dataset.photos, self.runner.threads)
         write_models(models, self.dataset.distorted_models)
@@ -162,12 +160,12 @@ class PoseEstimation:
             self.lens = self._best().lens
         if not self._found and self.evidence.more_effort_is_useless:
             return
-        other: Mapper = "incremental" if self.mapper == "global" else "global"
-        if not (self._good or self.evidence.flat):
-            self._try("as configured", other)
         if not self._good or self._contradicts_exif():
             # The photos may not determine the focal length.
             self._try("as configured", "incremental", self.lens.fixed)
+        other: Mapper = "incremental" if self.mapper == "global" else "global"
+        if not (self._good or self.evidence.flat):
+            self._try("as configured", other)
         if not self._enough:
             self._try("as configured", "plain")
         self._try_zooms()
@@ -305,15 +303,17 @@ class PoseEstimation:
         made = [attempt for attempt in self.attempts if attempt.models]
         if len(made) < 2:
             return (made or self.attempts)[0]
-        return best_attempt(made, [self._score(attempt).total for attempt in made])
+        return max(made, key=lambda attempt: self._score(attempt).total)
 
     def _score(self, attempt: Attempt) -> Score:
         if self.pairs is None:
             self.pairs, self.scores = read_matches(self.matched.database), []
         known = next((score for other, score in self.scores if other is attempt), None)
         if known is None:
-            exif = {i: photo.focal for i, photo in enumerate(self.photos, 1) if photo.focal}
-            known = score_of(attempt.models[0], self.pairs, exif)
+            exif, model = exif_focals(self.photos), attempt.models[0]
+            if not attempt.mapping.held:
+                model = estimate_lenses(model, exif, self.runner.threads)
+            known = score_of(model, self.pairs, exif)
             self.scores.append((attempt, known))
         return known
 
@@ -363,19 +363,3 @@ class PoseEstimation:
         """
         doubtful = self.lens.exif and bool(self._best().doubts) and not self._late
         return doubtful and bool(exif_focals(self.photos))
-
-
-def best_attempt(attempts: Sequence[Attempt], scores: Sequence[float]) -> Attempt:
-    """The attempt with the highest score in nats; one whose lens is in doubt, for example because
-    of EXIF, only if no other lens agrees equally well with the matches.
-
-    Errors of the calibration that all photos have in common are no evidence against EXIF.
-    """
-    undoubted = min((a.misfit for a in attempts if not a.doubts), default=float("inf"))
-
-    def value(entry: tuple[Attempt, float]) -> float:
-        attempt, score = entry
-        doubtful = attempt.doubts and undoubted <= (1 + EQUAL_ERROR) * attempt.misfit
-        return score / _IN_DOUBT if doubtful and score > 0 else score
-
-    return max(zip(attempts, scores, strict=True), key=value)[0]

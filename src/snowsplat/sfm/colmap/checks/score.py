@@ -4,7 +4,7 @@ Attempts have other photos, poses and lenses, and points of their own, so they a
 they have in common: the verified matches, also those that made no point. The score is the logarithm
 of the posterior probability, up to a constant that is the same for all models of these photos:
 
-    Σ_matches log(ε + (1 − ε) r(d)) + Σ_cameras log p(lens) − ½ k log n
+    Σ_matches log(ε + (1 − ε) r(d)) + f² Σ_cameras log p(lens) − ½ k log n
 
 Matches (MLESAC, Torr and Zisserman 2000). d is the Sampson distance of a match from the epipolar
 line of the poses, in pixels; infinite if its rays meet behind a camera. A true match has
@@ -19,9 +19,8 @@ kind: they add nothing. So a photo that is left out costs what its matches would
 in a wrong place costs more: log ε for each match. All matches of a pair count: places that look
 alike have fewer than photos that were taken side by side.
 
-Lenses. Logarithms of focal lengths, offsets of principal points, and distortions have normal priors
-with the standard deviations below. EXIF may be that of a larger photo, or of another one: it is
-wrong in `_EXIF_WRONG` of the cases, and tells nothing then.
+Lenses have the priors of `lenses.prior`. The matches count as if their errors were independent, but
+they are not, so the priors count as often as the matches do: f is `OVERDISPERSION`.
 
 Complexity. k is the number of parameters of the poses and lenses, n that of the matches of all
 photos (Schwarz 1978).
@@ -46,22 +45,9 @@ from snowsplat.scene.epipolar import (
 )
 from snowsplat.sfm.colmap.checks.consistency import rays_of
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
-from snowsplat.sfm.colmap.lenses.lens import (
-    GUESSED_FISHEYE,
-    GUESSED_FOCAL,
-    barrel,
-    is_fisheye,
-    pixels_per_radian,
-    used_cameras,
-)
-from snowsplat.sfm.colmap.lenses.principal_point import SIGMA
-
-# Standard deviations of the logarithm of a focal length: by EXIF, which rounds it to a millimetre,
-# and of all that people use: two thirds of photos are taken at 16 to 45 mm.
-_EXIF, _ANY_FOCAL = 0.05, 0.5
-_EXIF_WRONG = 0.05
-# Of the logarithm of fx / fy, and of the share by which distortion moves the corner of a photo.
-_SQUARE, _DISTORTION = 0.002, 0.1
+from snowsplat.sfm.colmap.lenses.lens import pixels_per_radian, used_cameras
+from snowsplat.sfm.colmap.lenses.posterior import OVERDISPERSION
+from snowsplat.sfm.colmap.lenses.prior import log_prior
 
 
 @dataclass(frozen=True)
@@ -114,7 +100,7 @@ def score_of(
     Args:
         pairs: the matches of all photos, with the image ids of ``model``. Models can be compared if
             these are the same.
-        exif: focal lengths in pixels, by the image ids of ``model``.
+        exif: focal lengths in pixels, by the camera ids of ``model``.
     """
     placed = set(model.reg_image_ids())
     distances, sides = [], []
@@ -128,11 +114,8 @@ def score_of(
     count = 6 * len(placed) + sum(len(model.cameras[i].params) for i in cameras)
     everything = sum(len(pair.in_first) for pair in pairs)
     complexity = 0.5 * count * math.log(max(2, everything))
-    lenses = 0.0
-    for number in cameras:
-        taken = (i for i in placed if model.image(i).camera_id == number)
-        known = [exif[i] for i in taken if i in exif]
-        lenses += lens_prior(model.cameras[number], float(np.median(known)) if known else None)
+    prior = sum(log_prior(model.cameras[i], exif.get(i)) for i in cameras)
+    lenses = OVERDISPERSION**2 * prior
     if not distances:
         return Score(0.0, lenses, complexity, LEAST_NOISE, LEAST_FALSE, 0.0)
     value, noise, false, true = likelihood(np.concatenate(distances), np.concatenate(sides))
@@ -150,32 +133,3 @@ def _distances(model: pycolmap.Reconstruction, pair: PairMatches) -> tuple[Float
     distance = distances_of_matches(pose.rotation.matrix(), pose.translation, *rays)
     side = (max(one.width, one.height) + max(two.width, two.height)) / 2
     return np.where(np.isfinite(distance), focal * distance, np.inf), side
-
-
-def lens_prior(camera: pycolmap.Camera, exif: float | None) -> float:
-    """The logarithm of the prior of a lens, relative to that of the most probable one; −∞ if it is
-    no lens.
-
-    ``exif``: its focal length in pixels, if EXIF has it.
-    """
-    if camera.is_spherical():
-        return 0.0
-    side = max(camera.width, camera.height)
-    focal = camera.mean_focal_length()
-    guess = GUESSED_FISHEYE if is_fisheye(camera.model_name) else GUESSED_FOCAL
-    usual = _normal(math.log(focal / (guess * side)) / _ANY_FOCAL)
-    if exif:
-        told = (1 - _EXIF_WRONG) * math.exp(_normal(math.log(focal / exif) / _EXIF))
-        usual = math.log(told + _EXIF_WRONG * _EXIF / _ANY_FOCAL * math.exp(usual))
-    offset = np.array([camera.principal_point_x, camera.principal_point_y])
-    offset = (offset - np.array([camera.width, camera.height]) / 2) / (SIGMA * side)
-    square = math.log(camera.focal_length_x / camera.focal_length_y) / _SQUARE
-    distortion = barrel(camera) / _DISTORTION
-    if not math.isfinite(distortion):  # it is not one-to-one over the whole photo
-        return -math.inf
-    return usual + _normal(*offset) + _normal(square) + _normal(distortion)
-
-
-def _normal(*values: float) -> float:
-    """The logarithm of the normal density of independent standard scores, relative to that of 0."""
-    return -0.5 * sum(float(value) ** 2 for value in values)

@@ -7,8 +7,7 @@ with what is known about lenses (`lens_findings`), and with the focal length in 
 
 An estimate in doubt is compared with a model whose focal length is held (`settle_lens`). If this
 model agrees equally well with the matches, then the photos do not determine the focal length, and
-the held one is better. Otherwise the photos contradict it, and the estimate is right. In the same
-way, a lens with one focal length is tried if the two of OPENCV differ: pixels are square.
+the held one is better. Otherwise the photos contradict it, and the estimate is right.
 """
 
 from __future__ import annotations
@@ -42,7 +41,8 @@ _WIDEST_HALF = 140.0
 # Directions in which the distortion of a fisheye lens is examined. In COLMAP, directions at 90° or
 # more from the axis have no pixels.
 _MAX_ANGLE = 89.0
-_POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+#: The camera models whose coefficients are k₁, k₂, p₁, p₂ and others, in this order.
+POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 # A lens that is no fisheye moves pixels inwards by at most this share.
 _MAX_BARREL = 0.28
 # An ordinary lens changes the distance of a pixel from the centre by at most this share, in
@@ -53,14 +53,11 @@ _MAX_STRETCH = 1.3
 # An ordinary lens moves pixels outwards or inwards. If it does both ("moustache" distortion), the
 # second one compensates the first one by at most this share of the distance from the centre.
 _MAX_MOUSTACHE = 0.02
-#: Two focal lengths agree equally well with the matches if the reprojection errors differ by less
+# Two focal lengths agree equally well with the matches if the reprojection errors differ by less
 #: than this share. Small systematic errors (rolling shutter, things that move) have this effect.
-EQUAL_ERROR = 0.05
+_EQUAL_ERROR = 0.05
 # A possible lens is used instead of an impossible one up to this factor between the errors.
 _MAX_WORSE = 2.0
-# fx and fy are in doubt if they differ by more than this share. Sensors have square pixels within
-# 0.1%; where photos determine both, the estimates differ by less than that, too.
-_SQUARE = 0.005
 # The estimated focal length is in doubt if it differs from that in EXIF by more than this share.
 _NEAR_EXIF = 0.1
 
@@ -260,7 +257,7 @@ def _implausible_fisheye(camera: pycolmap.Camera) -> str:
 
 def barrel(camera: pycolmap.Camera) -> float:
     """The share by which a polynomial distortion moves pixels at the border; negative: inwards."""
-    if camera.model_name not in _POLYNOMIAL:
+    if camera.model_name not in POLYNOMIAL:
         return 0.0
     ideal = _border(camera)
     fx, fy = camera.focal_length_x, camera.focal_length_y
@@ -341,8 +338,6 @@ def settle_lens(
     """
     known = exif_focals(photos)
     if not (lens.held or _doubts(model, known)):
-        model = _with_square_pixels(model, lens, refine)
-    if not (lens.held or _doubts(model, known)):
         return Settled(model, False, [])
 
     def refined(held: bool) -> pycolmap.Reconstruction:
@@ -354,38 +349,11 @@ def settle_lens(
                 break
         return made
 
-    free, held = _with_square_pixels(refined(False), lens, refine), refined(True)
-    ratio = misfit(held) / misfit(free)
-    if not _impossible(held) and ratio <= 1 + EQUAL_ERROR:
+    free, held = refined(False), refined(True)
+    most = _MAX_WORSE if _impossible(free) else 1 + _EQUAL_ERROR
+    if not _impossible(held) and misfit(held) <= most * misfit(free):
         return Settled(held, True, [])
-    if not _impossible(free):
-        return Settled(free, False, _doubts(free, known))
-    if not _impossible(held) and ratio <= _MAX_WORSE:
-        return Settled(held, True, [])
-    return Settled(None, False, _doubts(free, known))
-
-
-def _with_square_pixels(
-    model: pycolmap.Reconstruction, lens: Lens, refine: Refine
-) -> pycolmap.Reconstruction:
-    """``model`` with one focal length in cameras whose two differ, if it agrees equally well. A
-    camera model that the user has stated is kept."""
-    unequal = {}
-    for number in used_cameras(model):
-        camera = model.cameras[number]
-        # A panorama has no focal length: to ask for one ends the process.
-        if lens.model != "auto" or camera.model_name != "OPENCV":
-            continue
-        if abs(camera.focal_length_x / camera.focal_length_y - 1) > _SQUARE:
-            unequal[number] = _convert(camera, "RADIAL")
-    if not unequal:
-        return model
-    made = refine(model, list(unequal.values()), False)
-    # The errors of the photos of other cameras hardly change, so they do not count.
-    photos = [model.image(i).camera_id for i in model.reg_image_ids()]
-    share = sum(number in unequal for number in photos) / len(photos)
-    worse = misfit(made) > (1 + EQUAL_ERROR * share) * misfit(model)
-    return model if worse or _impossible(made) else made
+    return Settled(None if _impossible(free) else free, False, _doubts(free, known))
 
 
 def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[str]:

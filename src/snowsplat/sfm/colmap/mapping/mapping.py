@@ -20,7 +20,7 @@ from snowsplat.sfm.colmap.database import (
 from snowsplat.sfm.colmap.features.alignment import align_features
 from snowsplat.sfm.colmap.features.extraction import SEED
 from snowsplat.sfm.colmap.lenses.lens import robust_adjustment
-from snowsplat.sfm.colmap.lenses.principal_point import refine_principal_points
+from snowsplat.sfm.colmap.lenses.posterior import estimate_lenses
 from snowsplat.sfm.colmap.mapping.incremental import IncrementalMapper
 from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph, spread_subset
 from snowsplat.sfm.colmap.options import photos_with_adjustment
@@ -35,8 +35,6 @@ _MIN_POINTS_ALIGNED = 10
 # At the end, observations with a larger reprojection error are removed. In pixels of the resized
 # photo in which the features were detected.
 _MAX_REPROJECTION_ERROR = 3.0
-# Principal points of models with fewer photos, often a part of all photos, are not estimated.
-_MIN_PHOTOS_FOR_CENTRE = 8
 _MAX_MODELS = 20  # a model is started at most this number of times
 # A model is small if it has fewer photos than this, and than this share of the photos that are in
 # no model (as COLMAP's min_model_size, and its condition for few photos).
@@ -150,18 +148,22 @@ class Mapping:
             model.update_point_3d_errors()
         return mapping._refine(model)
 
-    def complete(self, model: pycolmap.Reconstruction, image_size: int) -> pycolmap.Reconstruction:
+    def complete(
+        self, model: pycolmap.Reconstruction, image_size: int, exif: dict[int, float]
+    ) -> pycolmap.Reconstruction:
         """The final poses, lenses and points of ``model``, which may be changed.
 
-        The features of each point are aligned, and bundle adjustment estimates principal points,
-        too, if it has estimated the focal lengths.
+        The features of each point are aligned, and the lenses are estimated with their priors, if
+        the focal lengths are not held.
 
-        ``image_size``: the longest side of the photos in which the features were detected.
+        Args:
+            image_size: the longest side of the photos in which the features were detected.
+            exif: as in `estimate_lenses`.
         """
         align_features(model, self.database, self.images, image_size, self.threads)
         self._refine(model, _MIN_POINTS_ALIGNED, tolerances=_ALIGNED_TOLERANCES)
-        if not self.held and model.num_reg_images() >= _MIN_PHOTOS_FOR_CENTRE:
-            model = refine_principal_points(model, self.threads)
+        if not self.held:
+            model = estimate_lenses(model, exif, self.threads)
             self._remove_outliers(model, _MIN_POINTS_ALIGNED)
         self._add_points(model)
         return model
