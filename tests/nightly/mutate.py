@@ -6,7 +6,7 @@
 The script puts small faults into the package, one at a time. The package is divided into parts, and
 each part has its own tests: only these run for a fault in the part. A test detects a fault if it
 fails, or if it takes three times as long as without the fault. The faults are made by the operators
-of mutmut, see mutation/mutants.py. Some faults have no observable effect; mutation/equivalents.py
+of mutmut, see mutation/mutants.py. Some faults have no observable effect; mutation/equivalents.toml
 lists them, with the reason for each. The script needs the extra "nightly" and a Linux system. The
 exit code is 1 if the tests of a part detect less than 90% of the faults in it.
 """
@@ -24,9 +24,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
 
-from mutation.equivalents import EQUIVALENTS
 from mutation.mutants import Mutant, mutants_of
 from mutation.runner import PACKAGE, Coverage, Outcome, Runner
+from mutation.tables import EQUIVALENTS
 
 REQUIRED = 0.9
 
@@ -146,12 +146,12 @@ def files_of(name: str) -> list[Path]:
 
 
 def report_stale(mutants: list[Mutant]) -> int:
-    """Print the entries of mutation/equivalents.py that match no mutant; returns their number."""
+    """Print the entries of mutation/equivalents.toml that match no mutant; returns their number."""
     files = {mutant.file for mutant in mutants}
     known = {(mutant.file, mutant.was, mutant.becomes) for mutant in mutants}
     stale = [key for key in EQUIVALENTS if key[0] in files and key not in known]
     for file, was, becomes in stale:
-        print(f"STALE in mutation/equivalents.py: {file}\n  - {was}\n  + {becomes}", flush=True)
+        print(f"STALE in mutation/equivalents.toml: {file}\n  - {was}\n  + {becomes}", flush=True)
     return len(stale)
 
 

@@ -3,7 +3,7 @@
     python tests/nightly/mutate_kernels.py                    all faults
     python tests/nightly/mutate_kernels.py --only cpu/ ssim   faults with this in file or text
 
-The faults are written by hand, in mutation/kernel_faults.py. The script puts them into a copy of
+The faults are written by hand, in mutation/kernel_faults.toml. The script puts them into a copy of
 the checkout, one at a time. A fault in a header or in native/cpu/ is compiled for the baseline
 instruction set. A fault in native/cuda/ is compiled by the emulation of the tests. Then the tests
 of the operation run until one fails. The script needs the extra "nightly", a Linux system and a C++
@@ -20,8 +20,8 @@ import sys
 import time
 from pathlib import Path
 
-from mutation.kernel_faults import FAULTS, Fault
 from mutation.runner import Broken, Outcome, Runner
+from mutation.tables import FAULTS, Fault
 
 REQUIRED = 0.9
 # Less optimisation than in the package, because compiling would take longer than the tests.
