@@ -77,12 +77,15 @@ def depth_maps(
 
     Args:
         sources: the source views of each view; see `source_views`.
-        points: (P, 3) in the world frame. Those that a view shows determine its range of depths.
+        points: (P, 3) in the world frame. Those that a view shows determine its least depth. The
+            largest one is infinite: a room behind an object, out of focus, has no points, and
+            would be found at a wrong depth within their range.
         longer_side: the maximum size of the maps, in pixels.
     """
     device = images.device
     pictures = in_threads(lambda view: Picture.from_view(view, images, longer_side), views, device)
-    return swept_maps(pictures, depth_ranges(views, points.to(device)), sources)
+    ranges = [span and (0.0, span[1]) for span in depth_ranges(views, points.to(device))]
+    return swept_maps(pictures, ranges, sources)
 
 
 @dataclass(frozen=True)
