@@ -27,10 +27,10 @@ from PIL import Image
 from snowsplat.data import ImageLoader, View
 from snowsplat.pipeline.blocks.plan import Plan, plan_blocks
 from snowsplat.pipeline.blocks.train import merge_blocks, train_blocks
-from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.benchmark import PlanOptions
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
+from snowsplat.pipeline.render import evaluate
 from snowsplat.pipeline.train import train
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at

@@ -24,9 +24,9 @@ from torch.nn.functional import max_pool2d
 
 from snowsplat.data import ImageLoader
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
+from snowsplat.pipeline.render import evaluate
 from snowsplat.pipeline.train import train
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.convert import convert
     from snowsplat.pipeline.describe import describe
-    from snowsplat.pipeline.evaluate import evaluate
     from snowsplat.pipeline.make import make
     from snowsplat.pipeline.observer import Observer
     from snowsplat.pipeline.options.benchmark import BenchmarkOptions, PlanOptions
@@ -51,7 +50,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.output.scene_files import write_gaussians
     from snowsplat.pipeline.output.scene_source import load_trained
     from snowsplat.pipeline.publish import publish
-    from snowsplat.pipeline.render import render_images
+    from snowsplat.pipeline.render import evaluate, render_images
     from snowsplat.pipeline.run.results import TrainingStopped
     from snowsplat.pipeline.train import resume, train
     from snowsplat.pipeline.videos import render_video
@@ -91,7 +90,7 @@ _MODULES = {
     "convert": "pipeline.convert",
     "decode_image": "extras.image.fit_image",
     "describe": "pipeline.describe",
-    "evaluate": "pipeline.evaluate",
+    "evaluate": "pipeline.render",
     "evaluate_views": "evaluation.metrics",
     "fit_image": "extras.image.fit_image",
     "load_dataset": "data",

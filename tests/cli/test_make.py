@@ -15,10 +15,10 @@ from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline import all_photos, make_plan
 from snowsplat.pipeline import make as make_module
-from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.make import STAGES
 from snowsplat.pipeline.options.make import PRESETS
 from snowsplat.pipeline.output.scene_source import load_trained, load_viewable
+from snowsplat.pipeline.render import evaluate
 from snowsplat.project.project import MAKE_RECORD as RECORD
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import TrainingFolder

@@ -12,8 +12,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.surface.depth import SurfaceRenderer
-from snowsplat.surface.isosurface import zero_level
-from snowsplat.surface.volume import SIDE, Volume, block_keys
+from snowsplat.surface.volume import SIDE, Volume, block_keys, zero_level
 from snowsplat.training.parts.depth_supervision import depth_term
 from snowsplat.training.parts.surfaces import planes_of
 

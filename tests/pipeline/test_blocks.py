@@ -19,10 +19,10 @@ from snowsplat.formats.ply import read_ply
 from snowsplat.pipeline.blocks.content import Cell, block_content, cut, ground_axes
 from snowsplat.pipeline.blocks.plan import Plan, plan_blocks
 from snowsplat.pipeline.blocks.train import merge_blocks, train_blocks
-from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.benchmark import PlanOptions
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
+from snowsplat.pipeline.render import evaluate
 from snowsplat.pipeline.train import train
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.synthetic.toy_dataset import write_toy_dataset

@@ -16,11 +16,11 @@ from snowsplat.pipeline.blocks.plan import plan_blocks
 from snowsplat.pipeline.blocks.train import merge_blocks, train_blocks
 from snowsplat.pipeline.clean import clean
 from snowsplat.pipeline.convert import convert
-from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.benchmark import PlanOptions
 from snowsplat.pipeline.options.scene import Edits
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained, load_viewable
+from snowsplat.pipeline.render import evaluate
 from snowsplat.pipeline.train import train
 from snowsplat.pipeline.watch import NewestScene
 from snowsplat.scene.edit import seen_from

@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from snowsplat.data import load_dataset
-from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
+from snowsplat.pipeline.render import evaluate
 from snowsplat.pipeline.run.refined_cameras import with_refined, write_refined
 from snowsplat.pipeline.run.results import TrainResult
 from snowsplat.pipeline.train import train

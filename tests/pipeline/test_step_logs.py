@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.pipeline.observer import Observer, Observers
+from snowsplat.pipeline.observer import COLUMNS, LOGS, CsvLog, Observer, Observers
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.results import TrainingStopped
-from snowsplat.pipeline.step_logs import COLUMNS, LOGS, CsvLog
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.util.errors import UserError

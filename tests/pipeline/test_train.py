@@ -9,11 +9,10 @@ import pytest
 from PIL import Image
 
 from snowsplat.data import load
-from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
-from snowsplat.pipeline.render import render_images
+from snowsplat.pipeline.render import evaluate, render_images
 from snowsplat.pipeline.run.results import TrainingStopped
 from snowsplat.pipeline.train import resume, train
 from snowsplat.synthetic.toy_dataset import write_toy_dataset

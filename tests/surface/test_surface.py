@@ -14,13 +14,13 @@ from snowsplat.scene.geometry import look_at
 from snowsplat.scene.mesh import filled_holes, largest_parts, vertex_normals, y_up
 from snowsplat.surface.colors import vertex_colors
 from snowsplat.surface.depth import DepthMap, SurfaceRenderer
-from snowsplat.surface.isosurface import zero_level
 from snowsplat.surface.volume import (
     Volume,
     block_coordinates,
     block_keys,
     fuse_maps,
     occupied_blocks,
+    zero_level,
 )
 
 _UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)

@@ -12,7 +12,7 @@ from PIL import Image
 from snowsplat.data import ImageLoader, load_dataset
 from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import pinhole_of
-from snowsplat.evaluation.renderings import Rendering
+from snowsplat.evaluation.metrics import Rendering
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import RenderOutput
 from snowsplat.training.parts.photo_agreement import confirmation

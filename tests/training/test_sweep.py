@@ -18,8 +18,7 @@ from torch.nn.functional import max_pool2d
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.photos.decode import ImageSource, load_views
 from snowsplat.data.photos.image_loader import ImageLoader
-from snowsplat.pipeline.confirmed_depth import confirm_by_photos
-from snowsplat.pipeline.mesh import _photos
+from snowsplat.pipeline.mesh import _photos, confirm_by_photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
@@ -186,7 +185,7 @@ def test_photos_that_are_larger_than_their_maps_are_decoded_once(
         return load_views(sources, background)
 
     monkeypatch.setattr("snowsplat.data.photos.image_loader.load_views", load)
-    monkeypatch.setattr("snowsplat.pipeline.confirmed_depth.LONGER_SIDE", 24)
+    monkeypatch.setattr("snowsplat.pipeline.mesh.LONGER_SIDE", 24)
     weight = torch.full((18, 24), 255, dtype=torch.uint8)
     small = [camera.scaled(24, 18) for camera in CAMERAS]
     maps = [

@@ -15,7 +15,7 @@ from PIL import Image
 
 from snowsplat import Dataset, Gaussians, TrainConfig, Trainer, load_dataset, ops, recipe
 from snowsplat.data.photos.decode import LoadedImage, load_image
-from snowsplat.evaluation.renderings import Rendering
+from snowsplat.evaluation.metrics import Rendering
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import render
 from snowsplat.synthetic.toy_dataset import write_toy_dataset

@@ -61,7 +61,7 @@ class Evaluate(JsonCommand):
     def _evaluate(self, chosen: SceneChoice) -> dict[str, Any]:
         """Print the figures of one folder; returns them."""
         from snowsplat.evaluation.lpips import Lpips
-        from snowsplat.pipeline.evaluate import evaluate, views_of
+        from snowsplat.pipeline.render import evaluate, views_of
 
         scene = chosen.load()
         views = views_of(scene, self.split)

@@ -15,7 +15,7 @@ from snowsplat.util.messages import message
 from snowsplat.util.settings import group, setting, switch
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.evaluate import Split
+    from snowsplat.pipeline.render import Split
 
 _OF_VIDEOS = ("seconds", "fps", "ease", "size", "side_by_side", "video")
 

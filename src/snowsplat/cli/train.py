@@ -127,8 +127,7 @@ class Train(JsonCommand):
             TrainingFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
         if dataset is None and not self.resume:
             raise UserError("train needs a dataset; add the folder of the photos and their cameras")
-        from snowsplat.pipeline.observer import Observers
-        from snowsplat.pipeline.step_logs import LOGS
+        from snowsplat.pipeline.observer import LOGS, Observers
         from snowsplat.pipeline.train import resume, train
 
         logs = [LOGS[name](TrainingFolder(self.output)) for name in self.log]

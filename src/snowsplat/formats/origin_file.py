@@ -9,8 +9,7 @@ import logging
 from pathlib import Path
 from typing import NamedTuple
 
-from snowsplat.scene.length import stored_metres
-from snowsplat.scene.origin import HERE, Origin, stored_origin
+from snowsplat.scene.origin import HERE, Origin, stored_metres, stored_origin
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import is_file, parse_json
 

@@ -1,8 +1,13 @@
-"""`render_images`: renders a scene from the cameras of its photos, and copies the photos."""
+"""`render_images`: renders a scene from the cameras of its photos, and copies the photos.
+
+`evaluate` measures PSNR, SSIM and LPIPS of a trained scene.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import errno
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,8 +17,8 @@ import numpy as np
 import torch
 
 from snowsplat.data import ImageLoader, View
-from snowsplat.evaluation.renderings import renderings
-from snowsplat.pipeline.evaluate import Split
+from snowsplat.evaluation.lpips import Lpips
+from snowsplat.evaluation.metrics import Evaluation, ViewMetrics, evaluate_views, renderings
 from snowsplat.pipeline.options.video import panorama_width
 from snowsplat.pipeline.output import image_files
 from snowsplat.pipeline.output.scene_source import TrainedScene
@@ -24,10 +29,14 @@ from snowsplat.scene.panorama import PanoramaRenderer
 from snowsplat.scene.render import render, to_8bit
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
+from snowsplat.util.process import single_threaded
+
+logger = logging.getLogger(__name__)
 
 Depth = Literal["none", "16bit", "color"]
 
 _RANGE_VIEWS = 8  # number of views that determine the range of the depth colours
+Split = Literal["test", "train"]
 
 
 def render_images(
@@ -160,3 +169,54 @@ def _render(
             queue.write(target.depth / file, shown)
     if steps:
         write_json(target.depth_units, steps)
+
+
+def evaluate(
+    scene: TrainedScene,
+    *,
+    split: Split = "test",
+    lpips: Lpips | Path | str | None = None,
+    on_view: Callable[[ViewMetrics], None] | None = None,
+) -> Evaluation:
+    """Compare the renderings of a scene with its photos; write OUT/metrics.json, if possible.
+
+        evaluate(load_trained("out/garden")).psnr
+
+    Args:
+        split: "test": the held-out photos; "train": the training photos.
+        lpips: a file of weights, see `snowsplat.evaluation.lpips`; None: LPIPS is not measured.
+        on_view: called after each view.
+
+    Returns:
+        PSNR, SSIM and LPIPS of each view, and their means.
+
+    Raises:
+        UserError: there are no photos in this split, or a photo or the weights file is damaged.
+        OSError: metrics.json cannot be written, for another reason than a folder or disk in which
+            nothing can be written.
+    """
+    views = views_of(scene, split)
+    if isinstance(lpips, Path | str):
+        lpips = Lpips.load(Path(lpips))
+    with single_threaded():  # so that the metrics do not depend on the number of cores
+        evaluation = evaluate_views(
+            scene.gaussians, views, background=scene.background, lpips=lpips, on_view=on_view
+        )
+    try:
+        scene.folder.write_metrics(scene.iteration, split, evaluation.as_json())
+    except OSError as error:  # the folder may be of somebody else; the figures are returned
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC):
+            raise
+        logger.warning("metrics.json was not written: %s", error)
+    return evaluation
+
+
+def views_of(scene: TrainedScene, split: Split) -> list[View]:
+    """The views of a split. Raises: UserError: there are none."""
+    views = scene.dataset.test if split == "test" else scene.dataset.train
+    if not views:
+        raise UserError(
+            "no photos were held out for testing; train with `hold_out`, or evaluate the `split` "
+            "train"
+        )
+    return views

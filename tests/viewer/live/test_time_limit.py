@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from snowsplat.viewer.live import time_limit
-from snowsplat.viewer.live.time_limit import ServerTimeLimit
+from snowsplat.viewer.live import viewer
+from snowsplat.viewer.live.viewer import ServerTimeLimit
 
 
 class Clock:
@@ -35,7 +35,7 @@ def clock(monkeypatch) -> Clock:
     fake = SimpleNamespace(
         monotonic=lambda: clock.now, thread_time=lambda: clock.used, sleep=clock.sleep
     )
-    monkeypatch.setattr(time_limit, "time", fake)
+    monkeypatch.setattr(viewer, "time", fake)
     monkeypatch.setattr(asyncio, "get_running_loop", lambda: clock)
     return clock
 
@@ -58,7 +58,7 @@ def test_a_pause_is_at_most_a_second(clock):
     clock.work(10.0)
     before = clock.now
     limit.measure()
-    assert clock.now - before == pytest.approx(1.0 + time_limit._TICK)
+    assert clock.now - before == pytest.approx(1.0 + viewer._MEASURED_EVERY)
     assert clock.called == [limit.measure] * 2
 
 

@@ -12,8 +12,7 @@ from PIL import Image
 from snowsplat.project.site_folder import SiteFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
-from snowsplat.viewer.web.hiding import hiding_of
-from snowsplat.viewer.web.panel import Description
+from snowsplat.viewer.web.panel import Description, hiding_of
 from snowsplat.viewer.web.publication import write_html, write_site
 from snowsplat.viewer.web.scene import ReadyScene, ready
 

@@ -21,12 +21,11 @@ from PIL import Image
 
 from snowsplat.data import ImageLoader
 from snowsplat.evaluation.lpips import Lpips
-from snowsplat.evaluation.metrics import Evaluation
-from snowsplat.evaluation.renderings import renderings
+from snowsplat.evaluation.metrics import Evaluation, renderings
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
+from snowsplat.pipeline.render import evaluate
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.render import to_8bit

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.image_loader import ImageLoader
-from snowsplat.evaluation.renderings import renderings
+from snowsplat.evaluation.metrics import renderings
 from snowsplat.evaluation.verdict import Reason
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.image_loader import Photos
-from snowsplat.evaluation.renderings import Rendering
+from snowsplat.evaluation.metrics import Rendering
 from snowsplat.scene.geometry import transform_points
 from snowsplat.scene.surface_normals import rays_of
 from snowsplat.training.starts.point_colors import point_colors

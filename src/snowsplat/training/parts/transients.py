@@ -45,7 +45,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
 from snowsplat.data.photos.decode import LoadedImage
-from snowsplat.evaluation.renderings import renderings
+from snowsplat.evaluation.metrics import renderings
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.part_report import PartReport, Section

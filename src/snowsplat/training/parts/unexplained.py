@@ -25,8 +25,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.image_loader import ImageLoader
-from snowsplat.evaluation.metrics import color_fit
-from snowsplat.evaluation.renderings import Rendering, renderings
+from snowsplat.evaluation.metrics import Rendering, color_fit, renderings
 from snowsplat.evaluation.verdict import Grade, Reason
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer

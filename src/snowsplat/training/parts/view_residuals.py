@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d, pad
 
-from snowsplat.evaluation.renderings import Rendering
+from snowsplat.evaluation.metrics import Rendering
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.depth_map import DepthMap
 

@@ -10,8 +10,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data import ImageLoader, View
-from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
-from snowsplat.evaluation.renderings import Rendering, renderings
+from snowsplat.evaluation.metrics import Evaluation, Rendering, ViewMetrics, renderings
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import in_colors, to_8bit
 from snowsplat.util.messages import Message, message

@@ -1,13 +1,17 @@
-"""`NetworkViewer`: a page for any number of browsers, and the images that they request."""
+"""`NetworkViewer`: a page for any number of browsers, and the images that they request.
+
+`ServerTimeLimit`: a server in the process that trains must not slow it down.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import html
 import itertools
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,7 +42,6 @@ from snowsplat.viewer.live.page_files import FILES, INDEX, POLICY
 from snowsplat.viewer.live.photos import Photos, fitted_photo, jpeg
 from snowsplat.viewer.live.pictures import Display, View, draw
 from snowsplat.viewer.live.session import RenderRequest, Session
-from snowsplat.viewer.live.time_limit import ServerTimeLimit
 
 _QUALITY = {"moving": 60, "still": 90, "idle": 90}  # of JPEG images
 _TICK = 0.02  # seconds between two checks for requested images
@@ -47,6 +50,9 @@ _POLL = 2.0  # seconds between two checks for a newer scene
 _TITLE = "<title>snowsplat</title>"
 
 _log = logging.getLogger(__name__)
+_SHARE = 0.2  # share of a core that the server uses
+_LONGEST_PAUSE = 1.0  # seconds for which the server is paused at a time
+_MEASURED_EVERY = 0.05  # seconds between two measurements of the server's processor time
 
 
 @dataclass(frozen=True)
@@ -298,3 +304,32 @@ class NetworkViewer:
                 scene.gaussians, scene.number, training=False
             ):
                 self.wait()
+
+
+class ServerTimeLimit:
+    """Limits the share of a core that the thread of a server uses during training."""
+
+    def __init__(self, training: Callable[[], bool]) -> None:
+        """``training``: whether the limit holds at present."""
+        self._training = training
+        # At the last measurement, in seconds: processor time of the thread, and the clock.
+        self._used = self._measured = 0.0
+        self._uncounted = 0.0  # processor time since then that is not counted, in seconds
+
+    def measure(self) -> None:
+        """Begin; it runs in the event loop of the server, and pauses its thread if necessary."""
+        used = time.thread_time() - self._used - self._uncounted
+        pause = used / _SHARE - (time.monotonic() - self._measured)
+        if self._measured and pause > 0.0 and self._training():
+            time.sleep(min(pause, _LONGEST_PAUSE))
+        self._used, self._measured, self._uncounted = time.thread_time(), time.monotonic(), 0.0
+        asyncio.get_running_loop().call_later(_MEASURED_EVERY, self.measure)
+
+    @contextlib.contextmanager
+    def uncounted(self) -> Iterator[None]:
+        """A context for work that the training has started: its time is not limited."""
+        before = time.thread_time()
+        try:
+            yield
+        finally:
+            self._uncounted += time.thread_time() - before

@@ -25,8 +25,7 @@ from snowsplat.scene.render import render
 from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.static import Served, ServedFile, served
-from snowsplat.viewer.web.hiding import Hiding, hiding_of
-from snowsplat.viewer.web.panel import Description, panel_settings
+from snowsplat.viewer.web.panel import Description, Hiding, hiding_of, panel_settings
 from snowsplat.viewer.web.stops import Stops, stops_of
 from snowsplat.viewer.web.viewer_page import (
     Annotation,
