@@ -170,7 +170,7 @@ def finished(library) -> StudioScene:
     write_gaussians(file, gaussians)
     publish(file, scene.site)
     scene.change(quality="draft")
-    facts = {"gaussians": N, "bytes": 1, "psnr": None, "seconds": 1.0, "verdict": None}
+    facts = {"gaussians": N, "bytes": 1, "psnr": None, "seconds": 1.0}
     result = {"file": file.name, "aligned": False, "reports": {}, **facts}
     result["shown"] = [str(file.stat().st_mtime_ns), scene.job.title]
     scene.write_state({"outcome": "done", "result": result})

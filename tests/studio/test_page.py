@@ -13,6 +13,7 @@ from snowsplat.studio import job
 
 from ..browser import Browser, Page
 from ..sfm.colmap import scenes
+from .conftest import of_the_command_line
 
 # The worker, with shorter trainings: `make` would take at least 15 seconds for one.
 _HURRIED = """
@@ -99,6 +100,15 @@ def test_from_photos_to_a_file(studio, forked, tmp_path, monkeypatch):
     assert studio.ask(f"scenes/{quote(scene.name)}")[1]["state"]["result"]["psnr"] > 15
 
 
+def test_a_scene_of_the_command_line_is_seen(studio, forked):
+    of_the_command_line(studio.library.folder / "tour")
+    with Browser(1280, 800, frames=2.0) as browser:
+        page = browser.open(studio.server.url + "#tour")
+        page.wait_for("!!document.querySelector('.viewer')", 60)
+        assert "50" in page.evaluate("document.querySelector('.figures').textContent")
+        assert not page.errors
+
+
 def test_what_the_photos_are_in_chinese(studio, forked, tmp_path):
     photos = scenes.write_photos(tmp_path / "photos", 4)
     shutil.copy(next(photos.iterdir()), photos / "zz.png")
@@ -112,4 +122,6 @@ def test_what_the_photos_are_in_chinese(studio, forked, tmp_path):
         assert "zz.png: 与 " in facts
         assert "是同一张图片" in facts
         assert "broken.jpg: 无法解码（不是已知格式的图像）" in facts
+        warning = "document.querySelector('[role=alert] [data-grade=poor]').textContent"
+        assert page.evaluate(warning) == "4 张照片太少"
         assert not page.errors

@@ -2,7 +2,10 @@
 
 import pytest
 
+from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.studio import job
+from snowsplat.util.files import write_json
+from snowsplat.util.messages import message
 
 from ..browser import Browser
 
@@ -47,10 +50,13 @@ def test_a_running_a_failed_and_a_finished_scene(studio, finished, monkeypatch):
         assert texts(page, "p.bad") == [KILLED["en"]]
         assert "Continue" in texts(page, "button")
 
-        done["result"]["verdict"] = {"head": KILLED, "why": [KILLED], "advice": []}
+        reason = Reason("poor", message("the memory was not enough"))
+        record = {"stages": {"scene": {"result": {"verdict": Verdict.of([reason]).as_json()}}}}
+        write_json(scene.made / "make.json", record)
         scene.write_state(done)
         page.wait_for("document.querySelector('.status')?.dataset.status === 'done'")
-        assert texts(page, ".card ul li") == [KILLED["en"]]
+        assert texts(page, ".card ul li") == ["the memory was not enough"]
+        assert texts(page, ".status .badge") == ["poor"]  # and the status is not green
         assert texts(page, ".card > h2")[0] == "Verdict"
         exports = studio.ask("scenes/Box")[1]["exports"]
         assert len(texts(page, ".export button")) == len(exports)

@@ -143,6 +143,14 @@ class Project:
         return [*self.dataset.left_out(), *(self.training.left_out() if self.training else [])]
 
     @property
+    def verdict(self) -> Any:
+        """The JSON value of the `Verdict` on the scene of `make`, as its record has it, or None."""
+        try:
+            return self.made["stages"]["scene"]["result"]["verdict"]
+        except (KeyError, TypeError):
+            return None
+
+    @property
     def has_seen_all_photos(self) -> bool:
         """Whether the scene is that of `make` after its last part: no photo can judge it."""
         if self.scene is None or self.edit is not None:

@@ -231,7 +231,6 @@ def _found(scene: StudioScene) -> dict[str, Any]:
         "psnr": psnr if facts.get("split") == "test" and isinstance(psnr, float) else None,
         "aligned": aligned,
         "seconds": None,
-        "verdict": [],
         "reports": existing_reports(scene, reports),
     }
 

@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 from starlette.requests import Request
 
+from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.project.project import Project
 from snowsplat.project.studio_scene import StudioScene
@@ -24,6 +25,7 @@ from snowsplat.studio.requests import (
     json_object,
     whole_number,
 )
+from snowsplat.studio.texts import verdict_in_languages
 from snowsplat.studio.uploads import Upload, uploads, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.run_lock import is_locked
@@ -132,17 +134,21 @@ ROUTES: SceneRoutes = (
 def summary(scene: StudioScene) -> dict[str, Any]:
     """A scene in the list of all; one whose file is damaged does not hide the others."""
     try:
-        about = {"title": scene.job.title, "created": scene.job.created}
+        about: dict[str, Any] = {"title": scene.job.title, "created": scene.job.created}
         status = status_of(scene, scene.state())
         about["status"] = "done" if status == "opening" else status
+        verdict = verdict_on(scene, status)
+        about["grade"] = verdict and verdict.grade
     except UserError:
-        about = {"title": scene.name, "created": "", "status": "failed"}
+        about = {"title": scene.name, "created": "", "status": "failed", "grade": None}
     return {"name": scene.name, "picture": picture_of(scene) is not None, **about}
 
 
 def details(scene: StudioScene) -> dict[str, Any]:
     """A scene for its own page."""
     state, made = scene.state(), scene.job
+    status = status_of(scene, state)
+    verdict = verdict_on(scene, status)
     has_page = state.pop("page", None) is not None  # its address is a secret of the job
     state.pop("placed", None)  # `_photos` tells it
     return {
@@ -153,7 +159,8 @@ def details(scene: StudioScene) -> dict[str, Any]:
         "inputs": made.inputs,
         "quality": made.quality,
         "minutes": made.minutes,
-        "status": status_of(scene, state),
+        "status": status,
+        "verdict": verdict and verdict_in_languages(verdict),
         "state": state,
         "has_page": has_page,
         "edited": edited_at(scene),
@@ -180,6 +187,13 @@ def status_of(scene: StudioScene, state: dict[str, Any]) -> str:
     status = str(state.get("outcome", "interrupted"))
     behind = status == "done" and not scene.is_shown() and not is_locked(scene.edit_lock)
     return "opening" if behind and os.access(scene.kept, os.W_OK) else status
+
+
+def verdict_on(scene: StudioScene, status: str) -> Verdict | None:
+    """That on a finished scene; None if nothing was held out that could judge it."""
+    if status not in ("done", "found", "opening"):
+        return None
+    return Verdict.from_json(Project.open(scene.made).verdict)
 
 
 def edited_at(scene: StudioScene) -> float:

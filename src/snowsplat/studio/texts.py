@@ -29,8 +29,9 @@ def in_languages(text: object) -> Texts:
 
 
 def verdict_in_languages(verdict: Verdict) -> dict[str, object]:
-    """A verdict on a scene: its head, its reasons and its advice."""
+    """A verdict on a scene: its grade, its head, its reasons and its advice."""
     return {
+        "grade": verdict.grade,
         "head": in_languages(verdict.head(message("the scene"))),
         "why": [in_languages(why) for why in verdict.why()],
         "advice": [in_languages(_next_time(advice)) for advice in verdict.advice],

@@ -29,9 +29,10 @@ from snowsplat.project.studio_scene import TASKS, StudioScene, version_of
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, predicted_seconds, survey
 from snowsplat.sfm.ingest.search.sources import find_sources
+from snowsplat.sfm.report.capture_verdict import few_photos
 from snowsplat.studio import changes
 from snowsplat.studio.recorder import Recorder
-from snowsplat.studio.texts import in_languages, verdict_in_languages
+from snowsplat.studio.texts import in_languages
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.flags import settings_from
 from snowsplat.util.interrupts import ended_by_signals
@@ -116,13 +117,13 @@ def _result(scene: StudioScene, made: MakeResult) -> dict[str, Any]:
         "psnr": known.psnr_aligned if known.exposures else known.psnr,
         "aligned": known.exposures,
         "seconds": made.seconds,
-        "verdict": made.verdict and verdict_in_languages(made.verdict),
         "reports": changes.existing_reports(scene, reports),
     }
 
 
 def survey_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
-    """What `make` would use of the inputs, and the seconds that it takes at each quality.
+    """What `make` would use of the inputs, the seconds that it takes at each quality, and whether
+    the photos are few.
 
     Raises: UserError: there is nothing to use.
     """
@@ -135,7 +136,14 @@ def survey_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
         if sources.posed is None:
             seconds[quality] += predicted_seconds(photos, preset.photos, quality, speed)
     facts = describe_photos(sources) | {"poses": sources.posed is not None}
+    few = few_photos(facts.get("photos", 0) + photos.frames)
     return {
+        "few": few
+        and {
+            "grade": few.grade,
+            "text": in_languages(few.text),
+            "advice": in_languages(few.advice),
+        },
         "facts": {name: _in_languages(value) for name, value in facts.items()},
         "count": photos.count,
         "seconds": {quality: round(value) for quality, value in seconds.items()},

@@ -52,6 +52,17 @@ _CLOSER = message(
 )
 
 
+def few_photos(count: int) -> Reason | None:
+    """The reason for a worse grade that the number of photos is; None: they are enough."""
+    if count >= _FEW:
+        return None
+    text = message("{count} photos are few", count=count)
+    if count < _TOO_FEW:
+        text = message("{count} photos are too few", count=count)
+    advice = message("take 30 to 100 photos of an object or a room, and more of a larger place")
+    return Reason("poor" if count < _TOO_FEW else "usable", text, advice, predicted=True)
+
+
 def capture_verdict(
     coverage: Coverage, sfm: Mapping[str, Any], problems: Mapping[str, Problem]
 ) -> Verdict:
@@ -72,14 +83,10 @@ def capture_verdict(
     # In a bent model, parts of the scene are doubled.
     grade: Grade = "poor" if sfm.get("agreement", 1.0) < _BENT else "usable"
     reasons += [Reason(grade, as_message(doubt)) for doubt in sfm.get("doubts", ())]
-    many = message("take 30 to 100 photos of an object or a room, and more of a larger place")
+    few = few_photos(photos)
     # A few photos are enough for one side of a scene.
-    if photos < _TOO_FEW:
-        too_few = message("{count} photos are too few", count=photos)
-        reasons.append(Reason("poor", too_few, many, predicted=True))
-    elif photos < _FEW and not (one_way and step <= _SMALL_STEP):
-        few_photos = message("{count} photos are few", count=photos)
-        reasons.append(Reason("usable", few_photos, many, predicted=True))
+    if few and (few.grade == "poor" or not (one_way and step <= _SMALL_STEP)):
+        reasons.append(few)
     if repeats := int((coverage.step < _SAME_PLACE).sum()):
         places = photos - repeats // 2  # each such place has at least two photos
         text = message(
@@ -90,8 +97,8 @@ def capture_verdict(
             photos=photos,
             places=places,
         )
-        few = places < _FEW
-        reasons.append(Reason("usable", text, many) if few else Reason("good", text))
+        fewer = few_photos(places)
+        reasons.append(Reason("usable", text, fewer.advice) if fewer else Reason("good", text))
     reasons += _ends(coverage, confirmed)
     error = sfm["reprojection_error"]
     if error is not None and error > _MAX_ERROR:

@@ -34,6 +34,18 @@ export function make(tag, attributes = {}, ...children) {
 export const button = (/** @type {string} */ key, /** @type {(event: any) => void} */ click) =>
     /** @type {HTMLButtonElement} */ (make("button", { type: "button", click }, say(key)));
 
+/** A line about a state: green only if it is a good one. `grade`: of a finished scene, null if nobody knows. */
+export function showStatus(
+    /** @type {HTMLElement} */ element,
+    /** @type {string} */ status,
+    /** @type {string | null | undefined} */ grade,
+) {
+    element.textContent = say(status);
+    element.dataset.status = status;
+    if (grade) element.append(" ", make("span.badge", { "data-grade": grade }, say(`grade_${grade}`)));
+    return element;
+}
+
 /** An error that the server has told in one line. */
 export class Refused extends Error {
     /**

@@ -1,6 +1,6 @@
 // The page of one scene: uploads, what the photos are, the progress of the job, and the result.
 
-import { action, ask, make, notice, reasonOf } from "./page.js";
+import { action, ask, make, notice, reasonOf, showStatus } from "./page.js";
 import { progressPart, stoppedPart } from "./scene_progress.js";
 import { resultPart } from "./scene_result.js";
 import { startPart } from "./scene_start.js";
@@ -83,8 +83,8 @@ export class ScenePage {
     #show(/** @type {Scene} */ scene) {
         this.#title.textContent = document.title = scene.title;
         const sending = uploads.has(this.name);
-        this.#status.textContent = sending ? "" : say(scene.status);
-        this.#status.dataset.status = scene.status;
+        showStatus(this.#status, scene.status, scene.verdict?.grade);
+        this.#status.hidden = sending;
         this.uploaded = scene.inputs.length === 0 && !scene.found;
         const parts = sending ? "upload" : scene.status;
         if (parts !== this.shown) {

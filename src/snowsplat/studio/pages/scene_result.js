@@ -55,8 +55,7 @@ export function resultPart(
                 : fact(result.aligned ? "psnr_aligned" : "psnr", `${result.psnr.toFixed(2)} dB`)),
             ...(result.seconds === null ? [] : fact("took", duration(result.seconds))),
         ),
-        result.verdict !== null &&
-            make("section.card", {}, make("h2", {}, say("verdict")), ...verdictOf(result.verdict)),
+        scene.verdict && make("section.card", {}, make("h2", {}, say("verdict")), ...verdictOf(scene.verdict)),
         make(
             "section.card",
             {},
@@ -67,7 +66,7 @@ export function resultPart(
         film,
         phone,
         !scene.found && make("details.card", {}, make("summary", {}, say("again")), ...againPart(page, scene)),
-    ].filter(part => part !== false);
+    ].filter(part => part !== false && part !== null);
 }
 
 function download(/** @type {string} */ address, /** @type {string} */ kind) {

@@ -25,6 +25,7 @@ export function startPart(
             const found = !page.uploaded || files.length > parts ? await ask(`${page.address}/survey`, "POST") : null;
             if (page.closed.aborted || page.shown !== "new") return;
             facts.replaceChildren(...(found ? factsOf(found.facts) : [make("p", {}, say("no_files"))]));
+            if (found?.few) facts.append(warning(found.few));
             if (parts) facts.append(make("p.bad", { role: "alert" }, say("not_arrived", parts)));
             if (page.uploaded) facts.append(moreFiles(page));
             form.hidden = !found;
@@ -38,6 +39,10 @@ export function startPart(
         }
     }
 }
+
+/** What to know before the time is spent. */
+const warning = (/** @type {import("./types.js").Few} */ { grade, text, advice }) =>
+    make("p", { role: "alert" }, make("span.badge", { "data-grade": grade }, told(text)), " ", told(advice));
 
 /** Sends the form, or the same wishes again. */
 export const start =

@@ -1,6 +1,6 @@
 // The start page, and which page is shown.
 
-import { action, ask, make, notice, reasonOf } from "./page.js";
+import { action, ask, make, notice, reasonOf, showStatus } from "./page.js";
 import { ScenePage } from "./scene.js";
 import { upload } from "./scene_upload.js";
 import { chosenLanguage, chosenTheme, say, speak } from "./text.js";
@@ -72,11 +72,9 @@ function tile(/** @type {any} */ scene) {
         { href: `#${encodeURIComponent(scene.name)}` },
         scene.picture ? make("img", { src: `${address}/picture`, alt: "", loading: "lazy" }) : make("div.empty"),
         make("b", {}, scene.title),
-        make(
-            "span.soft",
-            { "data-status": scene.status },
-            `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString(document.documentElement.lang)}`}`,
-        ),
+        showStatus(make("span.soft"), scene.status, scene.grade),
+        scene.created &&
+            make("span.soft", {}, new Date(scene.created).toLocaleDateString(document.documentElement.lang)),
     );
 }
 

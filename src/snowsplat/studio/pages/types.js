@@ -10,7 +10,8 @@
  * @property {string[]} inputs
  * @property {string | null} quality
  * @property {number | null} minutes
- * @property {string} status see `_status`
+ * @property {string} status see `status_of`
+ * @property {Verdict | null} verdict on a finished scene
  * @property {State} state
  * @property {boolean} has_page whether the page of a training can be seen
  * @property {number} edited the time of the last edit; 0 if there is none
@@ -44,20 +45,20 @@
  * @property {number | null} psnr
  * @property {boolean} aligned whether the PSNR is colour-aligned
  * @property {number | null} seconds
- * @property {Verdict | null} verdict
  * @property {Record<string, string>} reports addresses in the output folder, by kind
  */
 
-/** @typedef {{head: Told, why: Told[], advice: Told[]}} Verdict */
-/** @typedef {{name: string, title: string, status: string, created: string, picture: boolean}} Summary */
+/** @typedef {{grade: "good" | "usable" | "poor", head: Told, why: Told[], advice: Told[]}} Verdict */
+/** @typedef {{name: string, title: string, status: string, grade: string | null, created: string, picture: boolean}} Summary */
+/** @typedef {{grade: string, text: Told, advice: Told}} Few */
 /** @typedef {{path: string, size: number, modified: number, received: number}} Arrived */
 /** @typedef {{name: string, placed: boolean}} Photo */
 /** @typedef {{path: string, parent: string, folders: string[], files: string[], photos: number}} Listing */
 /** @typedef {{folder: string, addresses: {url: string, code: string}[]}} About */
 
 /**
- * What the photos are, and seconds by quality.
- * @typedef {{facts: Record<string, Fact>, seconds: Record<string, number>}} Survey
+ * What the photos are, whether they are few, and seconds by quality.
+ * @typedef {{facts: Record<string, Fact>, few: Few | null, seconds: Record<string, number>}} Survey
  */
 /** @typedef {Told | number | boolean | Record<string, Told | number>} Fact */
 
