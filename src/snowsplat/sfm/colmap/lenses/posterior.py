@@ -27,7 +27,7 @@ import numpy as np
 import pycolmap
 
 from snowsplat.sfm.colmap.lenses.lens import robust_adjustment, used_cameras
-from snowsplat.sfm.colmap.lenses.prior import Floats, Term, terms
+from snowsplat.sfm.colmap.lenses.prior import Floats, Term, log_prior, parameters, terms
 
 #: Standard deviation of the error of a parameter, divided by the formal one. Measured: 3 to 9 from
 #: measured cameras of two façades. Of estimates without an eighth of the photos each (jackknife):
@@ -44,8 +44,8 @@ def estimate_lenses(
 ) -> pycolmap.Reconstruction:
     """A copy of ``model`` with the most probable lenses, after bundle adjustment.
 
-    If bundle adjustment fails, or does not determine the parameters, this is ``model``. Its errors
-    of points must be up to date.
+    If bundle adjustment fails, does not determine the parameters, or ends with an impossible lens,
+    this is ``model``. Its errors of points must be up to date.
 
     ``exif``: focal lengths in pixels, by camera id.
     """
@@ -71,7 +71,12 @@ def estimate_lenses(
     for number, covariance in covariances.items():
         camera = made.cameras[number]
         known = terms(camera, exif.get(number))
-        camera.params = list(combine_with_prior(camera.params, covariance, known))
+        found = combine_with_prior(parameters(camera), covariance, known)
+        focals = list(camera.focal_length_idxs())
+        found[focals] = np.exp(found[focals])
+        camera.params = list(found)
+        if log_prior(camera, None) == -np.inf:
+            return model
     for frame in without:
         frame.reset_pose()
     _adjuster(made, images, scale, threads, free=False).solve()
@@ -116,7 +121,7 @@ def _covariances(
     adjuster: pycolmap.CeresBundleAdjuster,
     summary: pycolmap.BundleAdjustmentSummary,
 ) -> dict[int, Floats]:
-    """(k, k) of the parameters of each camera of the photos, by its id; none: undetermined."""
+    """(k, k) of the `parameters` of each camera of the photos, by its id; none: undetermined."""
     assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)  # of a Ceres adjuster
     ceres = summary.ceres_summary
     freedom = ceres.num_residuals_reduced - ceres.num_effective_parameters_reduced
@@ -136,5 +141,8 @@ def _covariances(
             continue
         if len(formal) != len(params) or not np.isfinite(formal).all():
             return {}
-        made[number] = variance * formal
+        slope = np.ones(len(params))  # of the parameters with logarithms
+        focals = list(model.cameras[number].focal_length_idxs())
+        slope[focals] = 1 / params[focals]
+        made[number] = variance * formal * np.outer(slope, slope)
     return made

@@ -1,10 +1,10 @@
 """What is known about a lens before any photo was compared: the prior of its parameters.
 
-`terms` has what is known, each as a linear combination of the parameters. It has a normal
-distribution, that of the lenses and photos that people use. But EXIF may be that of another photo,
-a photo may be cropped, and a video stretched: with the probability `_UNUSUAL`, the distribution is
-a wider one (a mixture of two normal distributions). So what the photos clearly contradict has no
-effect.
+The parameters are those of COLMAP, with logarithms of focal lengths (`parameters`). `terms` has
+what is known, each as a linear combination of them. It has a normal distribution, that of the
+lenses and photos that people use. But EXIF may be that of another photo, a photo may be cropped,
+and a video stretched: with the probability `_UNUSUAL`, the distribution is a wider one (a mixture
+of two normal distributions). So what the photos clearly contradict has no effect.
 
 Distortions are expressed at the corner of the photo, at the distance ρ from its centre in units of
 the focal length, as shares of this distance: k₁ ρ², k₂ ρ⁴, and p ρ for the tangential coefficients,
@@ -48,7 +48,7 @@ _POWERS = 2, 4, 1, 1
 
 @dataclass(frozen=True)
 class Term:
-    """A linear combination of the parameters of a camera, and its distribution."""
+    """A linear combination of the `parameters` of a camera, and its distribution."""
 
     factors: Floats  # (k,)
     mean: float
@@ -76,12 +76,19 @@ class Term:
         return log_density(1 - _UNUSUAL, self.usual), log_density(_UNUSUAL, self.wide)
 
 
+def parameters(camera: pycolmap.Camera) -> Floats:
+    """(k,) the parameters of ``camera``, with logarithms of focal lengths."""
+    made, focals = np.array(camera.params, float), list(camera.focal_length_idxs())
+    made[focals] = np.log(made[focals])
+    return made
+
+
 def terms(camera: pycolmap.Camera, exif: float | None) -> Iterator[Term]:
-    """What is known about the parameters of ``camera``, linear about its focal length.
+    """What is known about the `parameters` of ``camera``.
 
     ``exif``: its focal length in pixels, if EXIF has it.
     """
-    own, size = camera.mean_focal_length(), np.array([camera.width, camera.height], float)
+    size = np.array([camera.width, camera.height], float)
 
     def term(factors: Mapping[int, float], mean: float, sigmas: tuple[float, float]) -> Term:
         row = np.zeros(len(camera.params))
@@ -90,15 +97,14 @@ def terms(camera: pycolmap.Camera, exif: float | None) -> Iterator[Term]:
 
     focals = list(camera.focal_length_idxs())
     guess = GUESSED_FISHEYE if is_fisheye(camera.model_name) else GUESSED_FOCAL
-    ratio = (exif or guess * size.max()) / own
-    scaled = {i: 1 / (len(focals) * own) for i in focals}
-    yield term(scaled, 1 + math.log(ratio), _EXIF if exif else _FOCAL)
+    mean = math.log(exif or guess * size.max())
+    yield term(dict.fromkeys(focals, 1 / len(focals)), mean, _EXIF if exif else _FOCAL)
     if len(focals) == 2:
-        yield term({focals[0]: 1 / own, focals[1]: -1 / own}, 0.0, _SQUARE)
+        yield term({focals[0]: 1.0, focals[1]: -1.0}, 0.0, _SQUARE)
     for i, half in zip(camera.principal_point_idxs(), size / 2, strict=True):
         yield term({i: 1 / size.max()}, half / size.max(), _CENTRE)
     if camera.model_name in POLYNOMIAL:
-        corner = float(np.hypot(*size)) / (2 * own)
+        corner = float(np.hypot(*size)) / (2 * camera.mean_focal_length())
         coefficients = zip(camera.extra_params_idxs(), _POWERS, _DISTORTION, strict=False)
         for i, power, sigmas in coefficients:
             yield term({i: corner**power}, 0.0, sigmas)
@@ -111,4 +117,4 @@ def log_prior(camera: pycolmap.Camera, exif: float | None) -> float:
         return 0.0
     if not math.isfinite(barrel(camera)):  # it is not one-to-one over the whole photo
         return -math.inf
-    return sum(term.log_density(camera.params) for term in terms(camera, exif))
+    return sum(term.log_density(parameters(camera)) for term in terms(camera, exif))
