@@ -25,9 +25,8 @@ from snowsplat.sfm.colmap.features.extraction import WorkerProgress, extract_fea
 from snowsplat.sfm.colmap.lenses.lens import Lens, settle_lens, with_all_parameters
 from snowsplat.sfm.colmap.mapping.mapping import Mapping, usable_models
 from snowsplat.sfm.colmap.options import Effort, detection_size
-from snowsplat.sfm.colmap.pairs.choice import PairChoice, choose_pairs
+from snowsplat.sfm.colmap.pairs.choice import FEATURES, PairChoice, choose_pairs, similarity
 from snowsplat.sfm.colmap.pairs.pair_matching import match_pairs, verify_pairs
-from snowsplat.sfm.colmap.pairs.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import Mapper
 from snowsplat.util.messages import Message

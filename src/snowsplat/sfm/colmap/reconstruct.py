@@ -44,7 +44,6 @@ from snowsplat.sfm.colmap.lenses.lens import (
     exif_focals,
     focals_by_camera,
 )
-from snowsplat.sfm.colmap.lenses.posterior import estimate_lenses
 from snowsplat.sfm.colmap.mapping.mapping import write_models
 from snowsplat.sfm.colmap.options import Effort, SfmResult
 from snowsplat.sfm.colmap.pairs.choice import PairChoice
@@ -109,7 +108,9 @@ class PoseEstimation:
         self.runner.progress.show_poses(best.models[0], True)
         choice, image_size = self._describe_choice(best), best.matched.effort.image_size
         exif = exif_focals(self.photos) if best.lens.exif else {}
+        before = [camera.params[0] for camera in best.models[0].cameras.values()]
         models = [best.mapping.complete(model, image_size, exif) for model in best.models]
+        same = before == [camera.params[0] for camera in models[0].cameras.values()]
         for model in models:
             model.extract_colors_for_all_images(self.dataset.photos, self.runner.threads)
         write_models(models, self.dataset.distorted_models)
@@ -129,7 +130,7 @@ class PoseEstimation:
             models,
             self.photos,
             exif=best.lens.exif,
-            held=best.mapping.held,
+            held=best.mapping.held and same,
             unregistered=unregistered,
             pairs=best.matched.choice.description,
             attempts=self.log + choice,
@@ -310,9 +311,8 @@ class PoseEstimation:
             self.pairs, self.scores = read_matches(self.matched.database), []
         known = next((score for other, score in self.scores if other is attempt), None)
         if known is None:
-            exif, model = exif_focals(self.photos), attempt.models[0]
-            if not attempt.mapping.held:
-                model = estimate_lenses(model, exif, self.runner.threads)
+            exif = exif_focals(self.photos)
+            model = attempt.mapping.with_likely_lenses(attempt.models[0], exif)
             known = score_of(model, self.pairs, exif)
             self.scores.append((attempt, known))
         return known

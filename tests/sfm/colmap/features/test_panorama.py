@@ -4,7 +4,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.lens.models import lens_of
-from snowsplat.sfm.colmap.features.panorama import detect_in_panorama
+from snowsplat.sfm.colmap.features.extraction import detect_in_panorama
 from snowsplat.sfm.colmap.pairs.matching import match_descriptors
 
 from ....scenes.lenses import Equirectangular

@@ -103,7 +103,7 @@ def test_pixels_are_square_unless_the_photos_show_the_contrary(tmp_path, walk, s
     for pixels in walk.pixels:
         pixels[:, 0] *= stretched
     (model,), _ = mapped(tmp_path, walk, 500.0, Lens())
-    camera = estimate_lenses(model, {1: 500.0}, 1).cameras[1]
+    camera = estimate_lenses(model, {1: 500.0}, False, 1).cameras[1]
     ratio = camera.focal_length_x / camera.focal_length_y
     assert ratio == pytest.approx(stretched, abs=0.001 if stretched == 1 else 0.01)
 

@@ -64,7 +64,7 @@ def point_of(model):
 @pytest.mark.parametrize("true", [TRUE, CENTRE + np.array([110.0, 40.0])], ids=["", "cropped"])
 def test_photos_that_determine_the_principal_point_decide(true):
     given = photographed(list(round_walk()), box_of_points(), true=true)
-    found = estimate_lenses(given, {}, 1)
+    found = estimate_lenses(given, {}, False, 1)
     assert np.abs(point_of(found) - true).max() < 1.5
     assert found.compute_mean_reprojection_error() < 0.5
     assert (point_of(given) == CENTRE).all()
@@ -74,7 +74,7 @@ def test_photos_without_a_pose_do_not_matter():
     given = photographed(list(round_walk(13)), box_of_points())
     pycolmap.ObservationManager(given).deregister_frame(given.image(7).frame_id)
     given.update_point_3d_errors()
-    found = estimate_lenses(given, {}, 1)
+    found = estimate_lenses(given, {}, False, 1)
     assert np.abs(point_of(found) - TRUE).max() < 1.0
     assert found.num_reg_frames() == 12
     assert not found.image(7).has_pose
@@ -83,7 +83,7 @@ def test_photos_without_a_pose_do_not_matter():
 @pytest.mark.parametrize(("photos", "points", "noise"), [(4, 12, 1.0), (5, 15, 3.0)])
 def test_photos_that_hardly_determine_it_leave_it_near_the_centre(photos, points, noise):
     model = photographed(list(round_walk())[:photos], box_of_points(count=points), noise)
-    found = estimate_lenses(model, {}, 1)
+    found = estimate_lenses(model, {}, False, 1)
     assert found is not model
     assert np.abs(point_of(found) - CENTRE).max() < 0.01 * WIDTH
     assert found.compute_mean_reprojection_error() < noise
@@ -94,12 +94,12 @@ def test_photos_that_say_nothing_leave_the_model_as_it_is():
     things = np.random.default_rng(0).uniform((-4, -3, 5), (4, 3, 7), (200, 3))
     poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(), [x, 0, 0]) for x in (-0.5, 0.0, 0.5)]
     model = photographed(poses, things)
-    assert estimate_lenses(model, {}, 1) is model
+    assert estimate_lenses(model, {}, False, 1) is model
 
 
 def test_a_camera_without_principal_point_is_left_alone():
     model = pycolmap.Reconstruction()
-    assert estimate_lenses(model, {}, 1) is model
+    assert estimate_lenses(model, {}, False, 1) is model
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -184,7 +184,7 @@ def test_a_distortion_that_no_lens_has_needs_evidence():
     wrong = opencv(k1=0.2, k2=-0.5)
     model.cameras[1].model, model.cameras[1].params = wrong.model, list(wrong.params)
     model.update_point_3d_errors()
-    found = estimate_lenses(model, {}, 1)
+    found = estimate_lenses(model, {}, False, 1)
     k1, k2, p1, p2 = found.cameras[1].params[4:]
     assert abs(k1) < 0.1
     assert abs(k2) < 0.06
@@ -194,5 +194,16 @@ def test_a_distortion_that_no_lens_has_needs_evidence():
 
 def test_of_many_photos_some_tell_the_covariance(monkeypatch):
     monkeypatch.setattr(posterior, "_MOST_PHOTOS", 6)
-    found = estimate_lenses(photographed(list(round_walk()), box_of_points()), {}, 1)
+    found = estimate_lenses(photographed(list(round_walk()), box_of_points()), {}, False, 1)
     assert np.abs(point_of(found) - TRUE).max() < 1.0
+
+
+@pytest.mark.parametrize(("noise", "kept"), [(0.3, False), (20.0, True)])
+def test_a_focal_length_that_is_held_is_kept_if_the_photos_tell_less(noise, kept):
+    model = photographed(list(round_walk()), box_of_points(), noise)
+    held = 1.03 * FOCAL
+    model.cameras[1].params = [held, *CENTRE, 0.0]
+    model.update_point_3d_errors()
+    found = estimate_lenses(model, {1: held}, True, 1).cameras[1].mean_focal_length()
+    assert (found == held) == kept
+    assert kept or found == pytest.approx(FOCAL, rel=0.01)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from snowsplat.sfm.colmap.pairs.retrieval import nearest, similarity
+from snowsplat.sfm.colmap.pairs.choice import nearest, similarity
 
 
 def places(count, per_place, seed=0):

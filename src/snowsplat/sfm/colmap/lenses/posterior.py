@@ -40,14 +40,16 @@ _TOLERANCE = 1e-4  # of bundle adjustment, as in `robust_adjustment`
 
 
 def estimate_lenses(
-    model: pycolmap.Reconstruction, exif: Mapping[int, float], threads: int
+    model: pycolmap.Reconstruction, exif: Mapping[int, float], certain: bool, threads: int
 ) -> pycolmap.Reconstruction:
     """A copy of ``model`` with the most probable lenses, after bundle adjustment.
 
     If bundle adjustment fails, does not determine the parameters, or ends with an impossible lens,
     this is ``model``. Its errors of points must be up to date.
 
-    ``exif``: focal lengths in pixels, by camera id.
+    Args:
+        exif: focal lengths in pixels, by camera id.
+        certain: as in `terms`. If the photos tell less about them, this is ``model``.
     """
     numbers = [n for n in used_cameras(model) if not model.cameras[n].is_spherical()]
     if not numbers:
@@ -70,7 +72,9 @@ def estimate_lenses(
         return model
     for number, covariance in covariances.items():
         camera = made.cameras[number]
-        known = terms(camera, exif.get(number))
+        known = list(terms(camera, exif.get(number), certain))
+        if certain and known[0].variance(covariance) > known[0].usual ** 2:
+            return model
         found = combine_with_prior(parameters(camera), covariance, known)
         focals = list(camera.focal_length_idxs())
         found[focals] = np.exp(found[focals])

@@ -64,9 +64,12 @@ class Term:
         """The standard deviation of the more probable of the two distributions, if ``params`` (k,)
         were estimated with the errors ``covariance`` (k, k)."""
         away = float(self.factors @ params) - self.mean
-        variance = float(self.factors @ covariance @ self.factors)
-        usual, wide = self._both(away, variance)
+        usual, wide = self._both(away, self.variance(covariance))
         return self.usual if usual >= wide else self.wide
+
+    def variance(self, covariance: Floats) -> float:
+        """That of the combination, for parameters with the ``covariance`` (k, k)."""
+        return float(self.factors @ covariance @ self.factors)
 
     def _both(self, away: float, variance: float) -> tuple[float, float]:
         def log_density(share: float, deviation: float) -> float:
@@ -83,10 +86,10 @@ def parameters(camera: pycolmap.Camera) -> Floats:
     return made
 
 
-def terms(camera: pycolmap.Camera, exif: float | None) -> Iterator[Term]:
+def terms(camera: pycolmap.Camera, exif: float | None, certain: bool = False) -> Iterator[Term]:
     """What is known about the `parameters` of ``camera``.
 
-    ``exif``: its focal length in pixels, if EXIF has it.
+    ``exif``: its focal length in pixels, if EXIF has it; ``certain``: it is that of this photo.
     """
     size = np.array([camera.width, camera.height], float)
 
@@ -98,7 +101,8 @@ def terms(camera: pycolmap.Camera, exif: float | None) -> Iterator[Term]:
     focals = list(camera.focal_length_idxs())
     guess = GUESSED_FISHEYE if is_fisheye(camera.model_name) else GUESSED_FOCAL
     mean = math.log(exif or guess * size.max())
-    yield term(dict.fromkeys(focals, 1 / len(focals)), mean, _EXIF if exif else _FOCAL)
+    sigmas = (_EXIF[0], _EXIF[not certain]) if exif else _FOCAL
+    yield term(dict.fromkeys(focals, 1 / len(focals)), mean, sigmas)
     if len(focals) == 2:
         yield term({focals[0]: 1.0, focals[1]: -1.0}, 0.0, _SQUARE)
     for i, half in zip(camera.principal_point_idxs(), size / 2, strict=True):

@@ -153,20 +153,24 @@ class Mapping:
     ) -> pycolmap.Reconstruction:
         """The final poses, lenses and points of ``model``, which may be changed.
 
-        The features of each point are aligned, and the lenses are estimated with their priors, if
-        the focal lengths are not held.
+        The features of each point are aligned, and the lenses are estimated with their priors.
 
         Args:
             image_size: the longest side of the photos in which the features were detected.
-            exif: as in `estimate_lenses`.
+            exif: as in `with_likely_lenses`.
         """
         align_features(model, self.database, self.images, image_size, self.threads)
         self._refine(model, _MIN_POINTS_ALIGNED, tolerances=_ALIGNED_TOLERANCES)
-        if not self.held:
-            model = estimate_lenses(model, exif, self.threads)
-            self._remove_outliers(model, _MIN_POINTS_ALIGNED)
+        model = self.with_likely_lenses(model, exif)
+        self._remove_outliers(model, _MIN_POINTS_ALIGNED)
         self._add_points(model)
         return model
+
+    def with_likely_lenses(
+        self, model: pycolmap.Reconstruction, exif: dict[int, float]
+    ) -> pycolmap.Reconstruction:
+        """`estimate_lenses`; focal lengths that are held are not contradicted by the photos."""
+        return estimate_lenses(model, exif, self.held, self.threads)
 
     def _add_points(self, model: pycolmap.Reconstruction) -> None:
         """Add points that only two photos of ``model`` see, for the training. Changes ``model``."""
