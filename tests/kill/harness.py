@@ -40,7 +40,8 @@ from PIL import Image
 import snowsplat
 from snowsplat.data.colmap.model import read_model, read_points
 from snowsplat.data.colmap.types import ColmapImage
-from snowsplat.formats import read_gaussians
+from snowsplat.formats import format_for_writing, read_gaussians
+from snowsplat.formats.origin_file import Place, read_place, write_place
 from snowsplat.project.edit_record import PageEdit
 from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
@@ -433,6 +434,9 @@ def _moment(moments: random.Random, undisturbed: Ended) -> dict[str, float]:
     return {"at": at, "delay": 0.0 if kind < 0.8 else moments.uniform(0.0, 0.005)}
 
 
+OLD_PLACE = Place((1.0, 2.0, 3.0), 0.5)
+
+
 def convert_jobs(scene: Path, other: Path) -> list[Job]:
     """Convert into each format, over an existing file, and with edits."""
     targets = ["ply", "compressed.ply", "spz", "sog", "glb", "splat", "html"]
@@ -444,10 +448,15 @@ def convert_jobs(scene: Path, other: Path) -> list[Job]:
         def prepare(output: Path) -> None:
             if suffix != "html":  # files are recognised by their first bytes
                 shutil.copyfile(other, output)
+                write_place(output, OLD_PLACE)
 
         def check_killed(output: Path, whole: Path) -> None:
-            if output.exists() and digest(output) not in (digest(other), digest(whole)):
+            places = {digest(whole): read_place(whole), digest(other): OLD_PLACE}
+            if output.exists() and digest(output) not in places:
                 raise Defect("neither the old file nor the new one")
+            stored = suffix == "html" or format_for_writing(output).stores_origin
+            if output.exists() and not stored and read_place(output) != places[digest(output)]:
+                raise Defect("the place is that of another scene")
 
         def check_done(output: Path, whole: Path) -> None:
             if digest(output) != digest(whole):

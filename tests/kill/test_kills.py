@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,7 +35,8 @@ def killer(runner) -> Killer:
 
 @pytest.fixture
 def scenes(tmp_path) -> tuple[Path, Path]:
-    write_gaussians(tmp_path / "in.ply", some_gaussians(2000, 1))
+    placed = replace(some_gaussians(2000, 1), origin=(5e5, 20.0, -5.4e6))
+    write_gaussians(tmp_path / "in.ply", placed)
     write_gaussians(tmp_path / "other.ply", some_gaussians(100, 2))
     return tmp_path / "in.ply", tmp_path / "other.ply"
 

@@ -19,6 +19,7 @@ import shutil
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -52,7 +53,7 @@ def jobs(folder: Path, subcommands: list[str]) -> list[Job]:
     """The jobs of all subcommands, with small inputs in ``folder``."""
     found: list[Job] = []
     scenes = folder / "in.ply", folder / "other.ply"
-    write_gaussians(scenes[0], some_gaussians(4000, 1))
+    write_gaussians(scenes[0], replace(some_gaussians(4000, 1), origin=(5e5, 20.0, -5.4e6)))
     write_gaussians(scenes[1], some_gaussians(100, 2))
     found += convert_jobs(*scenes) if "convert" in subcommands else []
     found += publish_jobs(*scenes) if "publish" in subcommands else []

@@ -48,6 +48,7 @@ from snowsplat.project.edit_record import read_record
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
+from snowsplat.studio.changes import _written_at
 from snowsplat.studio.library import Library
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.util.safe_json import from_json
@@ -343,7 +344,11 @@ class Kills:
         original = read_gaussians(scene.made / about["state"]["result"]["file"])
         removed = record.removed if record else 0
         check(count + removed == len(original), "the record is that of another edit")
-        check(not scene.begun.exists(), "an edit is half done")
+        if scene.begun.exists():  # killed before the edit; the next one removes it
+            begun = json.loads(scene.begun.read_text())
+            check(
+                begun["time"] == _written_at(scene.folder / begun["file"]), "half an edit is done"
+            )
 
     def edit(self, kills: int) -> None:
         for number in range(kills):

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -15,6 +16,7 @@ from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.render import evaluate, render_images
 from snowsplat.pipeline.run.results import TrainingStopped
 from snowsplat.pipeline.train import resume, train
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.parts import unexplained
 from snowsplat.training.parts.unexplained import excluded_line
@@ -52,16 +54,48 @@ def options(steps: int, **changes) -> TrainOptions:
     return TrainOptions(settings={"iterations": steps}, **changes)
 
 
-def test_a_damaged_held_out_photo_is_found_before_the_training(dataset, tmp_path):
-    """The training does not read it, so the error would come at the end."""
-    shutil.copytree(dataset, tmp_path / "d")
-    first = min((tmp_path / "d" / "images").iterdir())
-    content = bytearray(first.read_bytes())
+def damage(path: Path) -> None:
+    """In the middle: detected only when the file is decoded."""
+    content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 0xFF
-    first.write_bytes(content)
-    with pytest.raises(UserError, match=f"{first.name}: cannot be decoded"):
-        train(tmp_path / "d", tmp_path / "out", options(5, hold_out=8))
-    assert not (tmp_path / "out").exists()
+    path.write_bytes(content)
+
+
+def test_photos_damaged_in_the_middle_are_left_out(dataset, tmp_path, caplog):
+    """A held-out one, one with such a mask, and another one."""
+    folder, out = tmp_path / "d", tmp_path / "out"
+    shutil.copytree(dataset, folder)
+    photos = sorted((folder / "images").iterdir())
+    mask = folder / "masks" / photos[2].name
+    mask.parent.mkdir()
+    with Image.open(photos[2]) as image:
+        Image.effect_noise(image.size, 99).save(mask)
+    for each in (photos[0], photos[1], mask):
+        damage(each)
+    train(folder, out, options(5, hold_out=4))
+    names = [photo.name for photo in photos[:3]]
+    assert f"3 of 9 photos are left out: {', '.join(names)}" in caplog.text
+    found = {each.photo: (each.stage, str(each.reason)) for each in TrainingFolder(out).left_out()}
+    assert found == dict.fromkeys(names, ("photos", "its data are damaged"))
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert (metrics["left_out"], len(metrics["views"])) == (names, 2)
+
+
+def test_held_out_photos_damaged_after_the_training(dataset, tmp_path):
+    """The others are judged and rendered, under their own numbers."""
+    folder, out = tmp_path / "d", tmp_path / "out"
+    shutil.copytree(dataset, folder)
+    train(folder, out, options(5, hold_out=3))
+    _, second, third = (view.image.path for view in load_trained(out).dataset.test)
+    damage(second)
+    judged = evaluate(load_trained(out))
+    assert (len(judged.views), judged.unjudged) == (2, (second.name,))
+    render_images(load_trained(out), splits=["test"])
+    (written,) = out.rglob("gt")
+    assert {file.name for file in written.iterdir()} == {"00000.png", "00002.png"}
+    damage(third)
+    with pytest.raises(UserError, match=f"{second.name}: cannot be decoded"):
+        evaluate(load_trained(out))
 
 
 def test_learnt_exposures_are_written(dataset, tmp_path):

@@ -10,7 +10,13 @@ from snowsplat.util.lazy import lazy_names
 
 if TYPE_CHECKING:
     from snowsplat.data.dataset import Dataset, Points, View, scene_extent
-    from snowsplat.data.load import DatasetFiles, load_dataset, read_dataset, read_files
+    from snowsplat.data.load import (
+        DatasetFiles,
+        load_dataset,
+        read_dataset,
+        read_files,
+        read_undamaged,
+    )
     from snowsplat.data.photos.decode import ImageSource, LoadedImage
     from snowsplat.data.photos.image_loader import ImageLoader
 
@@ -25,6 +31,7 @@ __all__ = [
     "load_dataset",
     "read_dataset",
     "read_files",
+    "read_undamaged",
     "scene_extent",
 ]
 
@@ -39,6 +46,7 @@ _MODULES = {
     "load_dataset": "load",
     "read_dataset": "load",
     "read_files": "load",
+    "read_undamaged": "load",
     "scene_extent": "dataset",
 }
 __getattr__, __dir__ = lazy_names(__name__, _MODULES)

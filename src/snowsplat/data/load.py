@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import torch
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.files.listing import folders_of_maps
 from snowsplat.data.files.masks import with_masks
+from snowsplat.data.files.photo_files import warn_of_unusable
 from snowsplat.data.frame.move_to_origin import move_to_origin
 from snowsplat.data.frame.near import near_of
 from snowsplat.data.hold_out import held_out_names
@@ -21,7 +23,9 @@ from snowsplat.data.lens.coverage import image_circle
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
 from snowsplat.data.maps.map_files import MAP_SUFFIXES
+from snowsplat.data.photos.check_pixels import check_pixels
 from snowsplat.data.photos.decode import ImageSource, load_thumbnail
+from snowsplat.data.photos.image_loader import DECODERS
 from snowsplat.data.readers import read_poses
 from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.scene.camera import Camera
@@ -198,7 +202,36 @@ def read_files(settings: DatasetSettings) -> DatasetFiles:
         origin=origin,
         metres_per_unit=found.metres_per_unit,
     )
-    return files.without(settings.left_out or [])
+    return files.without([*(settings.left_out or []), *(settings.damaged or [])])
+
+
+def read_undamaged(settings: DatasetSettings) -> tuple[DatasetSettings, DatasetFiles]:
+    """As `read_files`, without photos whose data are damaged, which the settings then name.
+
+    All photos and masks are decoded, at a fraction of their size.
+
+    Raises: UserError: also if at least half of the photos are damaged.
+    """
+    files = read_files(settings)
+
+    def check(image: PosedImage) -> UserError | None:
+        try:
+            for path in filter(None, (image.path, image.mask)):
+                check_pixels(path)
+        except UserError as error:
+            return error
+        return None
+
+    with ThreadPoolExecutor(DECODERS, thread_name_prefix="snowsplat-check") as pool:
+        found = zip(
+            files.images, pool.map(check, (image for image, _ in files.images)), strict=True
+        )
+        errors = {image.name: error for (image, _), error in found if error is not None}
+    if not errors:
+        return settings, files
+    warn_of_unusable(files.root, errors, len(files.images) - len(errors))
+    settings = replace(settings, damaged=[*(settings.damaged or []), *errors])
+    return settings, files.without([*errors])
 
 
 def _are_placeholder(points: Points) -> bool:

@@ -26,10 +26,12 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.data.dataset import View
+from snowsplat.data.files.photo_files import warn_of_unusable
 from snowsplat.data.photos.image_loader import ImageLoader, Photos
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, RenderOutput, render
+from snowsplat.util.errors import UserError
 from snowsplat.util.messages import Message, message
 from snowsplat.util.names import first_names
 
@@ -115,7 +117,7 @@ class Evaluation:
         if not self.unjudged:
             return Message("")
         return message(
-            "not judged, because they show one colour or are wholly masked: {names}",
+            "not judged, because they show one colour, are wholly masked or damaged: {names}",
             names=first_names(self.unjudged, 3),
         )
 
@@ -232,7 +234,7 @@ def evaluate_views(
     Returns: the metrics of the photos that can be judged, see `is_plain`, and the other names.
 
     Raises:
-        UserError: a photo is missing or damaged.
+        UserError: at least half of the photos cannot be decoded.
     """
     device = gaussians.means.device
     color = torch.tensor(background, dtype=torch.float32, device=device)
@@ -240,13 +242,16 @@ def evaluate_views(
     largest = max((view.camera.width * view.camera.height for view in views), default=0)
     ahead = _PHOTOS_AHEAD * 3 * largest
     with ImageLoader(views, budget_bytes=ahead, device=device) as loader:
-        for each in renderings(gaussians, views, loader, color, sh_degree=sh_degree, render=render):
+        options = {"sh_degree": sh_degree, "render": render, "leave_out": True}
+        for each in renderings(gaussians, views, loader, color, **options):
             if is_plain(each.photo, each.mask):
                 unjudged.append(each.view.name)
                 continue
             results.append(compare(each.image, each.photo, each.mask, lpips, each.view.name))
             if on_view is not None:
                 on_view(results[-1])
+    known = {*unjudged, *(each.name for each in results)}
+    unjudged += [view.name for view in views if view.name not in known]
     return Evaluation(results, tuple(unjudged))
 
 
@@ -311,6 +316,7 @@ def renderings(
     downscale: int = 1,
     sh_degree: int | None = None,
     render: Renderer = render,
+    leave_out: bool = False,
 ) -> Iterator[Rendering]:
     """Render the views one after the other, while the next photos are decoded.
 
@@ -320,13 +326,23 @@ def renderings(
         downscale: the factor by which renderings and photos are reduced: 1, 2 or 4.
         sh_degree: the largest SH degree to render; None uses all.
         render: renders the scene.
+        leave_out: views whose photos cannot be decoded are left out, and named in a warning.
 
-    Raises: UserError: a photo is missing or damaged.
+    Raises: UserError: a photo is missing or damaged, or with ``leave_out`` at least half of them.
     """
     photos.prefetch(views, downscale)
+    errors: dict[str, UserError] = {}
     for view in views:
-        photo = photos.get(view, downscale)
+        try:
+            photo = photos.get(view, downscale)
+        except UserError as error:
+            if not leave_out:
+                raise
+            errors[view.name] = error
+            continue
         camera = view.camera.downscaled(downscale).to(gaussians.means.device)
         output = render(gaussians, camera, background, sh_degree)
         image = output.image.clamp(0.0, 1.0)
         yield Rendering(view, image, photo.over(background), photo.mask, output)
+    if errors:
+        warn_of_unusable(views[0].image.path.parent, errors, len(views) - len(errors))

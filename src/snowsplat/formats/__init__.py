@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from snowsplat.formats.gaussian_arrays import GaussianArrays
-from snowsplat.formats.origin_file import Place, read_place, write_place
+from snowsplat.formats.origin_file import Place, read_place, written_with_place
 from snowsplat.formats.registry import (
     FORMATS,
     Format,
@@ -109,10 +110,9 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, **options: Any) -> N
     path = Path(path)
     format = format_for_writing(path)
     assert format.write is not None
-    format.write(path, GaussianArrays.from_gaussians(gaussians), **options)
-    if not format.stores_origin:
-        place = Place(gaussians.origin, gaussians.metres_per_unit)
-        write_place(path, place if format.read else Place())
+    place = Place(gaussians.origin, gaussians.metres_per_unit) if format.read else Place()
+    with nullcontext() if format.stores_origin else written_with_place(path, place):
+        format.write(path, GaussianArrays.from_gaussians(gaussians), **options)
     if gaussians.antialiased and not format.marks_antialiased:
         logger.warning(
             "%s: the scene is antialiased, but %s files cannot say so: viewers will show fine "

@@ -17,7 +17,7 @@ import torch
 from snowsplat.data import Dataset
 from snowsplat.formats import Format
 from snowsplat.formats.lod import LEVELS
-from snowsplat.formats.origin_file import origin_file, read_place, write_place
+from snowsplat.formats.origin_file import announce_place, origin_file, read_place, write_place
 from snowsplat.formats.spz import WRITTEN_VERSIONS
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.scene import Edits, file_size, gaussians_to_keep
@@ -327,6 +327,7 @@ def write_within(
                 "decimate", "no scene fits into {size}; use more", size=format_bytes(size)
             )
         place = read_place(path)
+        announce_place(target, place, path.stat())
     write_place(target, place)
 
 

@@ -154,9 +154,10 @@ def _render(
             sample = views[:: -(-len(views) // _RANGE_VIEWS)]
             near, far = image_files.depth_range([depth_of(view.camera) for view in sample])
         draw = partial(render, with_depth=with_depth)
-        drawn = renderings(gaussians, views, loader, color, render=draw)
-        for i, each in enumerate(drawn):
-            file, output = f"{i:05d}.png", each.output
+        drawn = renderings(gaussians, views, loader, color, render=draw, leave_out=True)
+        numbers = {view.name: i for i, view in enumerate(views)}
+        for each in drawn:
+            file, output = f"{numbers[each.view.name]:05d}.png", each.output
             queue.write(target.renders / file, to_8bit(each.image))
             queue.write(target.photos / file, to_8bit(each.photo))
             if output.depth is None:

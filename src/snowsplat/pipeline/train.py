@@ -12,12 +12,12 @@ from typing import Any
 
 from torch import Tensor
 
-from snowsplat.data import Dataset, read_dataset, read_files
+from snowsplat.data import Dataset, read_dataset, read_undamaged
 from snowsplat.ops import device_name
 from snowsplat.pipeline.compute import Compute, open_device
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.train import TrainOptions
-from snowsplat.pipeline.run.dataset_check import check_cameras, check_test_photos, edited, stamps_of
+from snowsplat.pipeline.run.dataset_check import check_cameras, edited, stamps_of
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
 from snowsplat.pipeline.run.results import TrainResult
@@ -171,14 +171,13 @@ class _Job:
         settings = options.dataset_settings(path)
         name = "custom" if options.config is not None else options.recipe or "default"
         config = options.configuration()
-        files = read_files(settings)
+        settings, files = read_undamaged(settings)
         dataset = files.dataset(settings.resolution)
         trusted = options.trust_cameras
         self.doubts, wrong = check_cameras(dataset, settings.path, trusted=trusted)
         if wrong:
             settings, files = replace(settings, left_out=wrong), files.without(wrong)
             dataset = files.dataset(settings.resolution)
-        check_test_photos(dataset.test)
         budget, plan = self._budget(), None
         if budget is not None:
             plan = self._plan(dataset, config, budget)

@@ -60,6 +60,7 @@ DATASET, SCENE = "dataset", "scene"
 #: Why the training has left a photo out.
 UNEXPLAINED = message("the scene does not explain it")
 #: Why a training leaves out a photo before its first step.
+DAMAGED = message("its data are damaged")
 CONTRADICTED = message("the matches with other photos contradict its pose")
 _SCENE = re.compile(r"iteration_(\d+)")
 
@@ -69,6 +70,7 @@ class DatasetSettings:
     """How the dataset of a training run is read: the arguments of `snowsplat.load_dataset`.
 
     ``left_out``: names of photos that are not used, because the matches contradict their poses.
+    ``damaged``: names of further ones, whose data or masks are damaged.
     """
 
     path: str
@@ -78,6 +80,14 @@ class DatasetSettings:
     first_held_out: int = 0
     test_list: str | list[str] | None = None
     left_out: list[str] | None = None
+    damaged: list[str] | None = None
+
+    def unused(self) -> tuple[LeftOut, ...]:
+        """The photos that are not used, and why."""
+        return (
+            *(LeftOut(name, "photos", DAMAGED) for name in self.damaged or []),
+            *(LeftOut(name, "poses", CONTRADICTED) for name in self.left_out or []),
+        )
 
 
 @dataclass(frozen=True)
@@ -370,14 +380,13 @@ class TrainingFolder:
             return {}
 
     def left_out(self) -> list[LeftOut]:
-        """The photos whose poses are wrong, and those that the scene does not explain."""
+        """The photos that were not used, and those that the scene does not explain."""
         names = self.read_metrics().get("left_out")
         found = [str(name) for name in names] if isinstance(names, list) else []
-        wrong = (self.settings()[0].left_out or []) if self.is_training() else []
-        return [
-            *(LeftOut(name, "poses", CONTRADICTED) for name in wrong),
-            *(LeftOut(name, "training", UNEXPLAINED) for name in found if name not in wrong),
-        ]
+        unused = self.settings()[0].unused() if self.is_training() else ()
+        known = {each.photo for each in unused}
+        rest = (LeftOut(name, "training", UNEXPLAINED) for name in found if name not in known)
+        return [*unused, *rest]
 
     def exposures(self) -> dict[str, list[float]]:
         """The exposure of each training photo in EV, by channel; empty if no gains were learnt.

@@ -25,6 +25,8 @@ GIT_LFS = b"version https://git-lfs.github.com/spec/"
 #: Called with the absolute path of a file before it is written and before it gets its name; they
 #: raise `UserError` if it must not be, such as `run_lock.LostLock`.
 CHECKS: list[Callable[[Path], None]] = []
+#: Called by `atomic_path` with the facts of a complete file before it gets its name, a key.
+COMPLETE: dict[Path, Callable[[os.stat_result], None]] = {}
 #: The folder in which `new_entries` makes what belongs into the folder around it.
 STAGE = ".snowsplat.new"
 _HERE = -100  # AT_FDCWD: paths are relative to the working folder
@@ -58,7 +60,9 @@ def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
         try:
             yield temporary
             with open(temporary, "rb+") as file:
-                os.fsync(file.fileno())
+                os.fsync(file.fileno())  # network file systems then know its time
+            if path in COMPLETE:
+                COMPLETE[path](temporary.stat())
             if not private:  # as mkstemp and _lock create them
                 os.chmod(temporary, _default_mode())
             _check(path)

@@ -114,7 +114,7 @@ def read_header(path: Path) -> Header:
 
     Raises: UserError: the file is missing or is not a readable image.
     """
-    with _open(path, header_only=True) as image:
+    with open_photo(path, header_only=True) as image:
         # If a PNG has no EXIF data before its pixels, getexif() would decode it to find some.
         has_exif = "exif" in image.info or image.format == "TIFF"
         orientation = image.getexif().get(Base.Orientation, 1) if has_exif else 1
@@ -165,7 +165,7 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
     Raises: UserError: the file is missing, damaged, or not an image.
     """
     size = scaled_size(source.width, source.height, side)
-    with _open(source.path) as opened:
+    with open_photo(source.path) as opened:
         opened.draft("RGB", (2 * side, 2 * side))  # only JPEG; the size is at least this one
         planes = _planes(_turn_upright(eight_bits(opened, source.path), source), source.path)
     if source.view is None:
@@ -264,14 +264,14 @@ def _mean_over_rows(values: Tensor, count: int) -> Tensor:
 
 def _decode(source: ImageSource, background: Sequence[float] | None) -> np.ndarray:
     """The photo of a source as stored: planes of `load_image` before they are scaled."""
-    with _open(source.path) as opened:
+    with open_photo(source.path) as opened:
         planes = _planes(_turn_upright(eight_bits(opened, source.path), source), source.path)
     return _with_alpha(planes, background) if planes.shape[0] == 4 else planes
 
 
 def _decode_mask(source: ImageSource) -> np.ndarray:
     """(H, W) uint8: the levels of a mask as stored."""
-    with _open(source.path) as opened:
+    with open_photo(source.path) as opened:
         return mask_levels(_turn_upright(opened, source))
 
 
@@ -356,7 +356,7 @@ def _with_alpha(planes: np.ndarray, background: Sequence[float] | None) -> np.nd
 
 
 @contextmanager
-def _open(path: Path, *, header_only: bool = False) -> Iterator[Image.Image]:
+def open_photo(path: Path, *, header_only: bool = False) -> Iterator[Image.Image]:
     """An image file. Raises UserError if it cannot be read, here or in the block."""
     try:
         with open_image(path, _FORMATS, header_only=header_only) as image:

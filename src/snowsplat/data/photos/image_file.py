@@ -44,7 +44,7 @@ _LONGEST_HEADER = 8 << 20
 # The marker at the start of a JPEG segment. The excluded markers have no length: they are part of
 # the data of a scan, or decoders skip them (TEM, 0x01).
 _MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")
-_SCAN = b"\xff\xda"  # start of a scan
+SCAN = b"\xff\xda"  # start of a scan
 _END = b"\xff\xd9"  # end of the image
 # The bytes at the end of a JPEG among which its end is searched: some programs add a few.
 _TAIL = 1 << 12
@@ -124,7 +124,7 @@ def _check_header(file: BinaryIO) -> bool:
         raise Problem("too many chunks")
     if start.startswith(_JPEG):
         header = start + file.read(_LONGEST_HEADER)
-        if len(header) > _LONGEST_HEADER and _SCAN not in _segments(header):
+        if len(header) > _LONGEST_HEADER and all(marker != SCAN for marker, *_ in segments(header)):
             raise Problem("too many bytes before its pixels")
         file.seek(max(0, size - _TAIL))
         return _END in file.read(_TAIL)
@@ -157,18 +157,18 @@ def _check_size(image: Image.Image, size: int) -> None:
 
 
 def _check_scans(image: Image.Image, path: Path) -> None:
-    scans = sum(marker == _SCAN for marker in _segments(path.read_bytes()))
+    scans = sum(marker == SCAN for marker, *_ in segments(path.read_bytes()))
     if scans * image.width * image.height > _MOST_SCANNED_PIXELS:
         raise Problem("too many scans ({scans}) for its size", scans=scans)
 
 
-def _segments(data: bytes) -> Iterator[bytes]:
-    """The markers of a JPEG's segments, up to the end of the image."""
-    at = len(_JPEG)
+def segments(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """The segments of a JPEG, up to the end of the image: the marker, the start and the end."""
+    end = len(_JPEG)
     for _ in range(_MOST_SEGMENTS):
-        marker = _MARKER.search(data, at)
+        marker = _MARKER.search(data, end)
         if marker is None or marker[0] == _END:
             return
-        yield marker[0]
-        at = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+        end = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+        yield marker[0], marker.start(), end
     raise Problem("too many segments")

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from snowsplat._version import __version__
-from snowsplat.data import read_files
+from snowsplat.data import read_files, read_undamaged
 from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.dataset import Points, PosedImage
 from snowsplat.data.lens.brown import as_colmap
@@ -154,7 +154,7 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
         test_list=options.test_list,
     )
     settings = train_options.dataset_settings(dataset)
-    files = read_files(settings)
+    settings, files = read_undamaged(settings)
     whole = files.dataset(settings.resolution)
     check_cameras(whole, settings.path, trusted=True)
     if options.blocks > len(whole.train):

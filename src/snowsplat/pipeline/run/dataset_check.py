@@ -1,4 +1,4 @@
-"""What is checked of a dataset: impossible cameras, damaged photos, and whether it has changed.
+"""What is checked of a dataset: impossible cameras, and whether it has changed.
 
 Stamps of photos and masks, which `resume` compares, tell what has changed, and hashes of the whole,
 which `make` compares.
@@ -9,21 +9,18 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from snowsplat.data import Dataset, View
+from snowsplat.data import Dataset
 from snowsplat.data.judge.verdict import judge
-from snowsplat.data.photos.decode import load_thumbnail
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
 
 _PART = 1 << 16  # bytes at the begin, the middle and the end of a file that its digest covers
-_SIDE = 64  # pixels of the copies of photos, which are not used
 
 
 @dataclass(frozen=True)
@@ -131,13 +128,3 @@ def check_cameras(
     wrong = {name for finding in findings if not trusted for name in finding.photos}
     views = [view for view in [*dataset.train, *dataset.test] if view.name in wrong]
     return tuple(finding.text for finding in findings), sorted({view.photo for view in views})
-
-
-def check_test_photos(views: Sequence[View]) -> None:
-    """Decode the held-out photos. The training itself decodes the others in its first steps.
-    Raises: UserError: a photo cannot be decoded.
-    """
-    workers = min(4, os.cpu_count() or 1)
-    with ThreadPoolExecutor(workers, thread_name_prefix="snowsplat-check") as pool:
-        for _ in pool.map(lambda view: load_thumbnail(view.image, _SIDE), views):
-            pass

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from snowsplat.data import Dataset, View
 from snowsplat.data.points_ply import write_points
 from snowsplat.formats import write_gaussians
-from snowsplat.formats.origin_file import Place, write_place
+from snowsplat.formats.origin_file import Place, written_with_place
 from snowsplat.pipeline.run.dataset_check import Stamp
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene import camera_json
@@ -34,8 +34,8 @@ def write_beginning(
     if dataset.points is not None:
         points = dataset.points
         write_points(folder.points, points.xyz.numpy(), points.rgb.numpy())
-    write_cameras(folder, [*dataset.train, *dataset.test])
-    write_place(folder.cameras, Place(dataset.origin, dataset.metres_per_unit))
+    with written_with_place(folder.cameras, Place(dataset.origin, dataset.metres_per_unit)):
+        write_cameras(folder, [*dataset.train, *dataset.test])
 
 
 def write_cameras(folder: TrainingFolder, views: Sequence[View]) -> None:

@@ -28,7 +28,6 @@ from snowsplat.pipeline.run.training_files import (
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import (
-    CONTRADICTED,
     UNEXPLAINED,
     DatasetSettings,
     TrainingFolder,
@@ -173,7 +172,7 @@ class TrainingRun:
     def _left_out(self) -> tuple[LeftOut, ...]:
         views = self.trainer.dataset.train
         return (
-            *(LeftOut(name, "poses", CONTRADICTED) for name in self.settings.left_out or []),
+            *self.settings.unused(),
             *(LeftOut(views[i].name, "training", UNEXPLAINED) for i in self.trainer.excluded),
         )
 

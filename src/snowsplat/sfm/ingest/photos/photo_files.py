@@ -17,6 +17,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
 from snowsplat.data.photos import image_file
+from snowsplat.data.photos.check_pixels import check_jpeg
 from snowsplat.data.photos.colour_profile import is_transparent, plain_pixels
 from snowsplat.data.photos.image_file import OPTIONAL_FORMATS, reason_of, scaled_size
 from snowsplat.sfm.ingest.content.panorama import STITCHED, Panorama, panorama_in_xmp
@@ -185,6 +186,7 @@ def decode(path: Path, header: Header, longest: int | None, page: int = 0) -> Im
     Raises: Unusable: the photo is damaged.
     """
     try:
+        check_jpeg(path)
         with open_image(path, page=page) as opened:
             image = plain_pixels(opened, path)
             if header.exif.orientation != 1:
@@ -203,6 +205,7 @@ def decode_small(path: Path, side: int) -> Image.Image:
     the errors of `decode`, because the whole file is read.
     """
     try:
+        check_jpeg(path)
         with open_image(path) as opened:
             opened.draft("RGB", scaled_size(opened.width, opened.height, 2 * side))
             return plain_pixels(opened, path)
