@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from snowsplat.extras.image import fit_image
 from snowsplat.extras.image.compact_file import read_compact
 from snowsplat.extras.image.fit_image import FILES
+from snowsplat.extras.image.options import FitOptions
 from snowsplat.scene.render import to_8bit
 
 from ..extras.image.photos import photo
@@ -100,6 +103,19 @@ def test_an_earlier_fit_is_not_replaced_by_mistake(refused, run, photo_file, tmp
     assert "contains an earlier fit; use --overwrite" in refused(*arguments)
     assert run(*arguments, "--seed", 1, "--overwrite").code == 0
     assert (tmp_path / "out" / "image.gimg").read_bytes() != before
+
+
+def test_an_interrupted_fit_replaces_nothing(fit, photo_file, tmp_path, monkeypatch):
+    out = shutil.copytree(fit, tmp_path / "out")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fit_image, "write_image_report", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        fit_image.fit_image(photo_file, out, FitOptions(gaussians=9, steps=5), overwrite=True)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
 def test_a_large_photo_is_scaled_down_and_rotated(run, tmp_path):

@@ -12,6 +12,7 @@ from PIL import Image
 from snowsplat.data import load
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
+from snowsplat.pipeline.output import image_files
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.render import evaluate, render_images
 from snowsplat.pipeline.run.results import TrainingStopped
@@ -96,6 +97,33 @@ def test_held_out_photos_damaged_after_the_training(dataset, tmp_path):
     damage(third)
     with pytest.raises(UserError, match=f"{second.name}: cannot be decoded"):
         evaluate(load_trained(out))
+
+
+def test_renderings_replace_others_at_once(dataset, tmp_path, monkeypatch):
+    """Not if rendering is interrupted; images that are no longer made are gone."""
+    out = tmp_path / "out"
+    train(dataset, out, options(5, hold_out=3))
+    scene = load_trained(out)
+    (folder,) = render_images(scene, splits=["test"], depth="16bit")
+    (folder / "00099.png").touch()
+
+    def files() -> dict[str, bytes]:
+        return {str(f.relative_to(out)): f.read_bytes() for f in sorted(out.rglob("ours_5/**/*.*"))}
+
+    before, left = files(), iter(range(3))
+
+    def interrupted(*_) -> None:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(image_files, "write_png", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            render_images(scene, splits=["test"], depth="16bit")
+    assert files() == before
+    render_images(scene, splits=["test"])
+    assert {*before} - {*files()} == {"test/ours_5/renders/00099.png"}
+    assert not list(out.rglob(".snowsplat.new"))
 
 
 def test_learnt_exposures_are_written(dataset, tmp_path):

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -242,8 +243,8 @@ def evaluate_views(
     largest = max((view.camera.width * view.camera.height for view in views), default=0)
     ahead = _PHOTOS_AHEAD * 3 * largest
     with ImageLoader(views, budget_bytes=ahead, device=device) as loader:
-        options = {"sh_degree": sh_degree, "render": render, "leave_out": True}
-        for each in renderings(gaussians, views, loader, color, **options):
+        draw = partial(renderings, sh_degree=sh_degree, render=render, leave_out=True)
+        for each in draw(gaussians, views, loader, color):
             if is_plain(each.photo, each.mask):
                 unjudged.append(each.view.name)
                 continue

@@ -28,7 +28,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.panorama import PanoramaRenderer
 from snowsplat.scene.render import render, to_8bit
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import write_json
+from snowsplat.util.files import new_entries, write_json
 from snowsplat.util.process import single_threaded
 
 logger = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ def render_images(
         The folders renders/ and the number of images in each.
 
     Raises:
-        UserError: there are no views in these splits, or a photo is damaged.
+        UserError: there are no views in these splits, or at least half of the photos are damaged.
         OSError: an image cannot be written.
     """
     scene, chosen = _chosen(scene, splits, antialias)
@@ -102,17 +102,18 @@ def render_panoramas(
     rendered = {}
     for split, views in chosen.items():
         folder = scene.folder.rendered(split, scene.iteration).panoramas
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
         places: list[Camera] = []
         for view, camera in zip(views, level_cameras([v.camera for v in views]), strict=True):
             same = (i for i, p in enumerate(places) if torch.allclose(camera.position, p.position))
             i = next(same, len(places))
             if i == len(places) or Path(view.name).stem.endswith("_front"):  # see `lens_views`
                 places[i : i + 1] = [camera]
-        for i, camera in enumerate(places):
-            with torch.no_grad():
+        with new_entries(folder.parent, [folder.name]) as new, torch.no_grad():
+            (new / folder.name).mkdir()
+            for i, camera in enumerate(places):
                 image = renderer.render(scene.gaussians, camera.cam_from_world, color)
-            image_files.write_panorama(folder / f"{i:05d}.jpg", to_8bit(image))
+                image_files.write_panorama(new / folder.name / f"{i:05d}.jpg", to_8bit(image))
         rendered[folder] = len(places)
     return rendered
 
@@ -146,10 +147,17 @@ def _render(
         assert output.depth is not None
         return image_files.mean_depth(output.depth, output.alpha)
 
-    for folder in (target.renders, target.photos, *([target.depth] if with_depth else [])):
-        folder.mkdir(parents=True, exist_ok=True)
+    target.path.mkdir(parents=True, exist_ok=True)
+    folders = [target.photos, *([target.depth] if with_depth else []), target.renders]
     steps: dict[str, float] = {}
-    with image_files.PngQueue() as queue, ImageLoader(views, device=device) as loader:
+    with (
+        new_entries(target.path, [folder.name for folder in folders]) as new,
+        ImageLoader(views, device=device) as loader,
+        image_files.PngQueue() as queue,
+    ):
+        target = RenderedFolder(new)
+        for folder in folders:
+            (new / folder.name).mkdir()
         if depth == "color":  # one range for all images, from a sample of them
             sample = views[:: -(-len(views) // _RANGE_VIEWS)]
             near, far = image_files.depth_range([depth_of(view.camera) for view in sample])

@@ -25,7 +25,7 @@ from snowsplat.scene.render import to_8bit
 from snowsplat.training.core.progress import Progress
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import check_output, write_json
+from snowsplat.util.files import check_output, new_entries, write_json
 from snowsplat.util.messages import message
 from snowsplat.util.process import single_threaded
 from snowsplat.util.settings import Setting, checked
@@ -105,24 +105,24 @@ def fit_image(
     Compute("cpu", threads).apply()
     output.mkdir(parents=True, exist_ok=True)
 
-    with single_threaded():
+    names = sorted(FILES, key="metrics.json".__eq__)  # which shows that there is a fit
+    with single_threaded(), new_entries(output, names) as new:
         fitter = Fitter(target, options)
-        moments = _run(fitter, target, output / "forming.mp4", observer)
+        moments = _run(fitter, target, new / "forming.mp4", observer)
         gaussians = fitter.gaussians
-        write_png(output / "image.png", to_8bit(gaussians.render()))
-        stored = write_compact(output / "image.gimg", gaussians)
+        write_png(new / "image.png", to_8bit(gaussians.render()))
+        stored = write_compact(new / "image.gimg", gaussians)
         file_psnr = compare(stored.render(), target).psnr
         files = dict(FILES)
         if gaussians.blending == "front-to-back":
-            write_svg(output / "image.svg", gaussians)
+            write_svg(new / "image.svg", gaussians)
         else:
-            (output / "image.svg").unlink(missing_ok=True)  # of an earlier fit
             del files["image.svg"]
-        file_bytes = (output / "image.gimg").stat().st_size
+        file_bytes = (new / "image.gimg").stat().st_size
         width, height = gaussians.width, gaussians.height
         bits = 8 * file_bytes / (width * height)
         write_image_report(
-            output / "report.html",
+            new / "report.html",
             Fitted(
                 name=photo.stem,
                 photo=(target * 255).round().byte(),
@@ -130,11 +130,11 @@ def fit_image(
                 moments=moments,
                 compact=(file_psnr, file_bytes, bits),
                 files=files,
-                video=output / "forming.mp4",
+                video=new / "forming.mp4",
             ),
         )
-    result = ImageResult(output, moments, file_psnr, file_bytes, bits)
-    write_json(output / "metrics.json", _metrics(result, options, (width, height)))
+        result = ImageResult(output, moments, file_psnr, file_bytes, bits)
+        write_json(new / "metrics.json", _metrics(result, options, (width, height)))
     return result
 
 
