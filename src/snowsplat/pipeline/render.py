@@ -176,8 +176,8 @@ def _render(
             else:
                 shown, steps[file] = image_files.depth_in_16_bits(mean)
             queue.write(target.depth / file, shown)
-    if steps:
-        write_json(target.depth_units, steps)
+        if steps:
+            write_json(target.depth_units, steps)
 
 
 def evaluate(
