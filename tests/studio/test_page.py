@@ -7,8 +7,10 @@ from pathlib import Path
 from urllib.parse import quote
 
 import pytest
+import torch
+from tests.gaussians import gaussians_in_box
 
-from snowsplat.formats import read_gaussians
+from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.studio import job
 
 from ..browser import Browser, Page
@@ -125,3 +127,19 @@ def test_what_the_photos_are_in_chinese(studio, forked, tmp_path):
         warning = "document.querySelector('[role=alert] [data-grade=poor]').textContent"
         assert page.evaluate(warning) == "4 张照片太少"
         assert not page.errors
+
+
+def test_a_finished_scene_is_opened_in_place_of_photos(studio, forked, tmp_path):
+    box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    given = tmp_path / "chair.spz"
+    write_gaussians(given, gaussians_in_box(box, 60, torch.Generator().manual_seed(0), 1))
+    with Browser(1280, 800, frames=2.0) as browser:
+        page = browser.open(studio.server.url)
+        page.wait_for("!!document.querySelector('.drop')")
+        drop(page, given)
+        page.wait_for("document.querySelector('.status')?.dataset.status === 'done'", 120)
+        page.wait_for("!!document.querySelector('.exports')")
+        assert page.evaluate("document.querySelector('h1').textContent") == "chair"
+        assert "60" in page.evaluate("document.querySelector('.figures').textContent")
+        assert not page.errors
+    assert len(read_gaussians(studio.library.folder / "chair/made/chair.ply")) == 60

@@ -159,6 +159,13 @@ class Project:
         return is_made and self.made.get("last_part") is True
 
 
+def scene_at(path: Path) -> Path | None:
+    """The scene file that ``path`` is, or that a folder has or consists of; or None."""
+    if path.is_file():
+        return path if _is_scene(path) else None
+    return Project.open(path).scene
+
+
 def is_output(folder: Path) -> bool:
     """Whether a folder is a dataset or an output folder that snowsplat has written."""
     records = folder / MAKE_RECORD, DatasetFolder(folder).record, TrainingFolder(folder).cfg_args

@@ -24,6 +24,8 @@ from snowsplat.viewer.http.guard import LOOK
 
 _PAGES = Path(__file__).parent / "pages"
 _FOLDERS = 500  # that are listed
+# The endings of the files that are listed: videos, zip files, and finished scenes.
+_FILES = (".mp4", ".mov", ".zip", ".ply", ".spz", ".sog", ".splat", ".ksplat", ".glb", ".usdz")
 
 
 async def page(studio: Studio, request: Request) -> Any:
@@ -98,7 +100,7 @@ def listing(path: Path) -> dict[str, Any]:
         "path": str(path),
         "parent": str(path.parent),
         "folders": folders[:_FOLDERS],
-        "files": [e.name for e in shown if e.suffix.lower() in (".mp4", ".mov", ".zip")][:_FOLDERS],
+        "files": [entry.name for entry in shown if entry.suffix.lower() in _FILES][:_FOLDERS],
         "photos": sum(entry.suffix.lower() in SUFFIXES for entry in shown),
     }
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.edit import film, film_preview
 from snowsplat.pipeline.make import make
@@ -25,12 +26,14 @@ from snowsplat.pipeline.options.make import PRESETS, MakeOptions
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.results import MakeResult
 from snowsplat.project.edit_record import shown_file
+from snowsplat.project.project import scene_at
 from snowsplat.project.studio_scene import TASKS, StudioScene, version_of
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, predicted_seconds, survey
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.report.capture_verdict import few_photos
 from snowsplat.studio import changes
+from snowsplat.studio.library import safe_name
 from snowsplat.studio.recorder import Recorder
 from snowsplat.studio.texts import in_languages
 from snowsplat.util.errors import UserError, message_of
@@ -87,17 +90,31 @@ def _make(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
         scene.begun.unlink(missing_ok=True)
     job = scene.job
     scene.map.unlink(missing_ok=True)  # the photos may be others now
-    options = settings_from(MakeOptions, job.settings())
-    with LivePage(port=0) as page:
-        made = make(
-            scene.inputs(), scene.made, options, overwrite=True, observer=recorder, page=page
-        )
-    recorder.begin("page")
-    file = shown_file(made.scene)
+    if (given := _given_scene(scene)) is not None:
+        recorder.begin("page")
+        file = scene.made / f"{safe_name(job.title)}.ply"
+        file.parent.mkdir(exist_ok=True)
+        convert(given, file, overwrite=True)
+        result = {"file": file.name, "bytes": file.stat().st_size, "reports": {}}
+        result |= {"psnr": None, "aligned": False, "seconds": None}
+    else:
+        options = settings_from(MakeOptions, job.settings())
+        with LivePage(port=0) as page:
+            made = make(
+                scene.inputs(), scene.made, options, overwrite=True, observer=recorder, page=page
+            )
+        recorder.begin("page")
+        file, result = shown_file(made.scene), _result(scene, made)
     shown = [version_of(file), job.title]
     site = changes.publish_site(scene, file, job.title)
     recorder.leave()
-    return _result(scene, made) | {"gaussians": site.gaussians, "shown": shown}
+    return result | {"gaussians": site.gaussians, "shown": shown}
+
+
+def _given_scene(scene: StudioScene) -> Path | None:
+    """A finished scene, if that was given in place of photos."""
+    inputs = scene.inputs()
+    return scene_at(inputs[0]) if len(inputs) == 1 else None
 
 
 def _film(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
@@ -123,10 +140,12 @@ def _result(scene: StudioScene, made: MakeResult) -> dict[str, Any]:
 
 def survey_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
     """What `make` would use of the inputs, the seconds that it takes at each quality, and whether
-    the photos are few.
+    the photos are few; or the name of the finished scene that was given.
 
     Raises: UserError: there is nothing to use.
     """
+    if (given := _given_scene(scene)) is not None:
+        return {"scene": given.name}
     sources = find_sources(scene.inputs())
     photos = survey(sources)
     speed = measure_speed(thread_count(None))

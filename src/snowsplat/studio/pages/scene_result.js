@@ -65,7 +65,8 @@ export function resultPart(
         ),
         film,
         phone,
-        !scene.found && make("details.card", {}, make("summary", {}, say("again")), ...againPart(page, scene)),
+        result.seconds !== null &&
+            make("details.card", {}, make("summary", {}, say("again")), ...againPart(page, scene)),
     ].filter(part => part !== false && part !== null);
 }
 

@@ -24,6 +24,7 @@ export function startPart(
             const parts = files.filter(file => file.received < file.size).length;
             const found = !page.uploaded || files.length > parts ? await ask(`${page.address}/survey`, "POST") : null;
             if (page.closed.aborted || page.shown !== "new") return;
+            if (found?.scene) return await start(page, () => ({ title: scene.title }))();
             facts.replaceChildren(...(found ? factsOf(found.facts) : [make("p", {}, say("no_files"))]));
             if (found?.few) facts.append(warning(found.few));
             if (parts) facts.append(make("p.bad", { role: "alert" }, say("not_arrived", parts)));

@@ -57,8 +57,8 @@
 /** @typedef {{folder: string, addresses: {url: string, code: string}[]}} About */
 
 /**
- * What the photos are, whether they are few, and seconds by quality.
- * @typedef {{facts: Record<string, Fact>, few: Few | null, seconds: Record<string, number>}} Survey
+ * What the photos are, whether they are few, and seconds by quality; or the finished scene that was given.
+ * @typedef {{facts: Record<string, Fact>, few: Few | null, seconds: Record<string, number>, scene?: string}} Survey
  */
 /** @typedef {Told | number | boolean | Record<string, Told | number>} Fact */
 
