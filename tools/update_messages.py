@@ -19,7 +19,7 @@ from babel.messages.pofile import read_po, write_po
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "snowsplat"
 LANGUAGE = "zh"
 # The calls whose first text is a message. For others: the positions of the texts.
-_CALLS = ("message", "print_message", "needed", "warning", "info", "UserError", "Problem")
+_CALLS = ("message", "print_message", "inform", "needed", "warning", "info", "UserError", "Problem")
 _KEYWORDS = dict.fromkeys(_CALLS) | {"plural": (1, 2), "SettingError": (2,)}
 
 Key = str | tuple[str, str]

@@ -1,11 +1,7 @@
-"""`snowsplat make`, from photos to files: its output, kills, repeated stages."""
+"""`snowsplat make`, from photos to files: its output, repeated stages."""
 
 import json
 import shutil
-import signal
-import subprocess
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,33 +22,16 @@ from snowsplat.sfm import cost
 from snowsplat.sfm.ingest.search import sources
 from snowsplat.util.stages import Stages
 
-from ..fork_server import popen
 from ..sfm.colmap import scenes
 
 #: With few passes, there are up to 75% more steps.
 QUICK = replace(PRESETS["draft"], iterations=120)
-#: The command as a separate process, with the same short training and frequent checkpoints.
-PROGRAM = """
-import sys
-from dataclasses import replace
-from snowsplat.pipeline import make as make_module
-from snowsplat.pipeline import make_plan
-from snowsplat.cli.main import main
-make_module._CHECKPOINT_SECONDS = 0.2
-make_module.PRESETS["draft"] = replace(make_module.PRESETS["draft"], iterations=120)
-sys.exit(main())
-"""
 
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
     """9 photos, 320×240; read-only for the tests. The name has spaces and an umlaut."""
     return scenes.write_photos(tmp_path_factory.mktemp("make") / "Häuser am See", 9)
-
-
-@pytest.fixture
-def quick(monkeypatch) -> None:
-    monkeypatch.setitem(PRESETS, "draft", QUICK)
 
 
 def files(folder: Path) -> set[str]:
@@ -200,56 +179,6 @@ def test_a_dataset_is_trained_with_its_poses(run, refused, dataset, tmp_path, mo
     assert "scene: repeated" in again.out
 
 
-@pytest.fixture
-def killed(photos, tmp_path) -> Callable[..., str]:
-    """Run the command as a process, kill it when a condition holds; returns its output."""
-
-    def killed(out: Path, when: Callable[[], bool], with_signal: int) -> str:
-        arguments = ("make", photos, "-o", out, "--quality", "draft", "--threads", 1)
-        process = popen("-c", PROGRAM, *arguments, stderr=subprocess.STDOUT)
-        deadline = time.monotonic() + 120
-        while not when() and process.poll() is None:
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
-        process.send_signal(with_signal)
-        text = process.communicate(timeout=60)[0]
-        assert process.returncode == (130 if with_signal == signal.SIGINT else -with_signal), text
-        return text
-
-    return killed
-
-
-@pytest.mark.nightly  # kill/test_kills.py kills at other moments
-@pytest.mark.sfm
-def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
-    """The same command resumes each time; finished stages are not repeated."""
-    out = tmp_path / "out"
-
-    def recorded(stage: str) -> bool:
-        record = out / "dataset/sfm.json"
-        return record.is_file() and f'"{stage}"' in record.read_text()
-
-    killed(out, (out / "dataset/distorted/database.db").exists, signal.SIGKILL)
-    killed(out, lambda: recorded("poses"), signal.SIGKILL)
-    killed(out, (out / "scene/config.json").exists, signal.SIGKILL)
-    text = killed(out, lambda: any(out.glob("scene/checkpoints/step*")), signal.SIGKILL)
-    assert text.count("done before") == 4
-    newest = max(out.glob("scene/checkpoints/step*"))
-    text = killed(
-        out,
-        lambda: max(out.glob("scene/checkpoints/step*"), default=newest) > newest,
-        signal.SIGINT,
-    )
-    assert f"resuming from {newest}" in text
-    assert text.count("resume with: snowsplat make") == 1
-    result = run("make", photos, "-o", out, "--quality", "draft", "--threads", 1)
-    assert result.code == 0, result.err
-    assert "resuming from" in result.out
-    assert (out / "Häuser am See.ply").is_file()
-    assert len(list(out.glob("scene/test/ours_*/renders/*.png"))) == 1
-    assert not list(out.rglob("*.tmp"))
-
-
 @pytest.mark.sfm
 def test_a_short_time_for_many_photos_uses_fewer(run, tmp_path, monkeypatch):
     """On a slow machine; the same command again repeats nothing and keeps the plan."""
@@ -267,6 +196,17 @@ def test_a_short_time_for_many_photos_uses_fewer(run, tmp_path, monkeypatch):
     assert again.code == 0, again.err
     assert again.out.count("done before") == 7
     assert "of 12 photos" not in again.out
+
+
+def test_ctrl_c_names_the_command_that_resumes(run, photos, monkeypatch):
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt("stopped after step 5")
+
+    monkeypatch.setattr(make_module, "make", stopped)
+    result = run("make", photos, "--quality", "draft", "--overwrite")
+    assert result.code == 130
+    command = f"snowsplat make '{photos}' --quality draft"
+    assert result.out.splitlines() == ["stopped after step 5", f"resume with: {command}"]
 
 
 # Errors

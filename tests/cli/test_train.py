@@ -159,26 +159,6 @@ def wait_for(path: Path, process) -> None:
         time.sleep(0.002)
 
 
-def test_kill_9_and_resume_give_the_same_scene(run, start, dataset, tmp_path):
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    flags = ("--iterations", 120, "--threads", 1, "--checkpoint-every", 20, "--eval", "-q")
-    assert run("train", dataset, "-o", whole, *flags).code == 0
-    process = start("train", dataset, "-o", killed, *flags)
-    wait_for(killed / "checkpoints/step_000060.safetensors", process)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    # If the newest checkpoint is damaged too, the one before it is used.
-    newest = max((killed / "checkpoints").iterdir())
-    newest.write_bytes(newest.read_bytes()[:1000])
-    result = run("train", "-o", killed, "--resume")
-    assert result.code == 0, result.err
-    assert "damaged" in result.err
-    assert len(result.err.splitlines()) == 1
-    assert "resuming from" in result.out
-    assert scene(killed, 120) == scene(whole, 120)
-    assert (killed / "metrics.json").read_bytes() == (whole / "metrics.json").read_bytes()
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path, number):
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"

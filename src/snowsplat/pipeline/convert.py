@@ -174,17 +174,15 @@ def convert(
         write_placed(target, scene)
     if any(written[0].origin) and format.name != "glTF" and not georeferenced:
         x, y, z = (f"{value:.15g}" for value in written[0].origin)
-        observer.note(
-            message(
-                "positions are relative to the origin {x} {y} {z}, {noted}",
-                x=x,
-                y=y,
-                z=z,
-                noted=_noted(format, target),
-            )
+        observer.inform(
+            "positions are relative to the origin {x} {y} {z}, {noted}",
+            x=x,
+            y=y,
+            z=z,
+            noted=_noted(format, target),
         )
     if georeferenced and not any(written[0].origin):
-        observer.note(message("the scene has no origin; its positions are written as they are"))
+        observer.inform("the scene has no origin; its positions are written as they are")
     return format
 
 

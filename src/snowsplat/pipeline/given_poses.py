@@ -34,12 +34,10 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
     except UserError as error:
         reason = error.message
     if reason:
-        observer.note(
-            message(
-                "{name}: its camera poses are not used, but estimated again: {reason}",
-                name=name,
-                reason=reason,
-            )
+        observer.inform(
+            "{name}: its camera poses are not used, but estimated again: {reason}",
+            name=name,
+            reason=reason,
         )
         return None
     line = message(
@@ -55,15 +53,13 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
         )
     observer.note(line)
     if without:
-        observer.note(
-            message(
-                "{name}: {without} of {photos} photos have no pose and are not used (the first "
-                "is {path})",
-                name=name,
-                without=len(without),
-                photos=len(sources.photos),
-                path=shown(without[0].path),
-            )
+        observer.inform(
+            "{name}: {without} of {photos} photos have no pose and are not used (the first "
+            "is {path})",
+            name=name,
+            without=len(without),
+            photos=len(sources.photos),
+            path=shown(without[0].path),
         )
     return dataset
 

@@ -238,7 +238,7 @@ class _Job:
         """The result of a stage, which is executed unless it is finished."""
 
         def on_change(reason: str) -> None:
-            self.observer.note(message("{name}: repeated ({reason})", name=name, reason=reason))
+            self.observer.inform("{name}: repeated ({reason})", name=name, reason=reason)
 
         self.observer.begin(name)
         outcome = self.stages.run(name, settings, outputs, work, on_change)
@@ -375,14 +375,12 @@ class _Job:
             left *= 1.0 - SHARE  # for the last part
         shortest = max(_MIN_SECONDS, _MIN_SHARE * given)
         if left < shortest:
-            self.observer.note(
-                message(
-                    "{given} is too short: finding the camera poses took {elapsed}; training for "
-                    "{shortest} anyway",
-                    given=duration(given),
-                    elapsed=duration(self._elapsed()),
-                    shortest=duration(shortest),
-                )
+            self.observer.inform(
+                "{given} is too short: finding the camera poses took {elapsed}; training for "
+                "{shortest} anyway",
+                given=duration(given),
+                elapsed=duration(self._elapsed()),
+                shortest=duration(shortest),
             )
         return max(left, shortest) / 60.0
 

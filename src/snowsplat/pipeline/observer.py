@@ -17,7 +17,7 @@ from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
-from snowsplat.util.messages import Message
+from snowsplat.util.messages import Message, message
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,6 +52,10 @@ class Observer:
 
     def note(self, line: Message) -> None:
         """A line of information for the user."""
+
+    def inform(self, key: str, /, **values: Any) -> None:
+        """`note` a message with values; see `message`."""
+        self.note(message(key, **values))
 
     def begin(self, stage: str) -> Report:
         """Called for every stage, also if an earlier run has finished it.

@@ -22,7 +22,6 @@ from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import check_output
-from snowsplat.util.messages import message
 from snowsplat.viewer.http.static import Served
 from snowsplat.viewer.web.panel import Description, made_on
 from snowsplat.viewer.web.publication import site_files, write_one_file, write_site
@@ -86,10 +85,8 @@ def publish(
     about = Description(options.title or project.name, options.licence, made_on(source.file))
     if any(source.gaussians.origin):
         place = " ".join(f"{value:.15g}" for value in source.gaussians.origin)
-        observer.note(
-            message(
-                "the page does not know the place of the scene, the origin {place}", place=place
-            )
+        observer.inform(
+            "the page does not know the place of the scene, the origin {place}", place=place
         )
     folder.mkdir(parents=True, exist_ok=True)
     if options.for_editing:
@@ -159,10 +156,8 @@ def viewed_scene(
         def levels(gaussians: Gaussians) -> Path:
             target = Path(folder) / INDEX
             write_levels(target, gaussians, observer)
-            observer.note(
-                message(
-                    "to keep them: snowsplat convert {path} FOLDER/{index}", path=path, index=INDEX
-                )
+            observer.inform(
+                "to keep them: snowsplat convert {path} FOLDER/{index}", path=path, index=INDEX
             )
             return target
 

@@ -158,7 +158,7 @@ class _Job:
         if request.page is not None and count() > 1:
             raise UserError("the page needs one process; leave out `view`, and use snowsplat watch")
         self.request, self.out, self.options = request, request.out, request.options
-        self.note = request.observer.note
+        self.note, self.inform = request.observer.note, request.observer.inform
         self.device = self.options.compute.apply()
         open_device(self.device)
         reset_peak()
@@ -191,9 +191,9 @@ class _Job:
         self.note(_described(dataset))
         if budget is not None and plan is not None:
             time = duration(budget.seconds)
-            self.note(message("{time} on this machine: {plan}", time=time, plan=plan.summary()))
+            self.inform("{time} on this machine: {plan}", time=time, plan=plan.summary())
         if "sweep" in config.starts:
-            self.note(message("computing depth maps for the initialisation"))
+            self.inform("computing depth maps for the initialisation")
         self.photos = stamps_of(dataset, settings.path)
         self.shards.of_first(Setup(settings, memory.config))
         trainer = self._trainer(dataset, memory.config)
@@ -228,13 +228,11 @@ class _Job:
         start.arrays.clear()  # the trainer has a copy, which is the one in the memory plan
         self.out.write_settings(settings, config_to_json(memory.config))
         self.note(_described(dataset))
-        self.note(
-            message(
-                "resuming from {path}, step {step} of {iterations}",
-                path=start.path,
-                step=start.step,
-                iterations=trainer.schedule.iterations,
-            )
+        self.inform(
+            "resuming from {path}, step {step} of {iterations}",
+            path=start.path,
+            step=start.step,
+            iterations=trainer.schedule.iterations,
         )
         return self._run(settings, meta.recipe, trainer, memory, budget)
 
@@ -313,18 +311,13 @@ class _Job:
         plan: Plan | None = None,
     ) -> TrainResult:
         device, plan_text = device_name(self.device), memory.summary()
-        self.note(
-            message("training on {device_name}; {memory}", device_name=device, memory=plan_text)
-        )
+        self.inform("training on {device_name}; {memory}", device_name=device, memory=plan_text)
         most = _BYTES_IN_FILE * (memory.limit or len(trainer.gaussians))
         if (free := shutil.disk_usage(self.out.path).free) < most:
-            self.note(
-                message(
-                    "only {free} are free on the disk, and the scene may need {most}: free some "
-                    "space",
-                    free=format_bytes(free),
-                    most=format_bytes(most),
-                )
+            self.inform(
+                "only {free} are free on the disk, and the scene may need {most}: free some space",
+                free=format_bytes(free),
+                most=format_bytes(most),
             )
         work = Work.for_training(trainer.config, trainer.dataset)
         pace = Pace(work)
@@ -366,7 +359,7 @@ class _Job:
                 path=out.path,
                 what=what,
             )
-        self.note(message("{path}: no checkpoint yet; starting at step 0", path=out.path))
+        self.inform("{path}: no checkpoint yet; starting at step 0", path=out.path)
         return None
 
 

@@ -65,7 +65,7 @@ def watch(
     if not of_folder and compute in (None, Compute()):
         try:
             if _attached(folder.path, page, observer):
-                observer.note(message("the training has ended; its result follows"))
+                observer.inform("the training has ended; its result follows")
         except KeyboardInterrupt:
             return
     data, background = load_dataset_of(folder, dataset, resolution)
@@ -95,14 +95,14 @@ def _attached(output: Path, page: LivePage, observer: Observer) -> bool:
         except OSError:  # it has ended, or runs on another computer
             return False
         with connection.makefile("rb") as replies:
-            observer.note(message("the training opens its page after the present step"))
+            observer.inform("the training opens its page after the present step")
             line = replies.readline()
             if not line:
                 return True
             reply = from_json(PageReply, parse_json(line))
             if reply.error:
                 raise UserError(reply.error)
-            observer.note(message("closing the page does not end the training"))
+            observer.inform("closing the page does not end the training")
             observer.page_opened(reply)
             replies.readline()
     return True

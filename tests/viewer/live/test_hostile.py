@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -119,42 +119,6 @@ def test_an_image_that_cannot_be_rendered_does_not_end_the_training(watched):
             assert time.monotonic() < end
             watched.step()
             visitor.pictures(0.02)
-
-
-def test_buttons_and_settings_of_a_browser(watched):
-    """The training pauses and makes single steps; all browsers are told."""
-    session = watched.viewer.session
-
-    def until(true: Callable[[], bool]) -> None:
-        end = time.monotonic() + 20
-        while not true():
-            assert time.monotonic() < end
-            watched.viewer.serve(watched.trainer.gaussians, 0, training=False)
-            visitor.pictures(0.02)
-
-    with Visitor(watched.viewer.url) as visitor, Visitor(watched.viewer.url) as other:
-        visitor.view()
-        watched.step()
-        visitor.send("training", do="pause")
-        until(lambda: session.paused and visitor.told.get("training", {}).get("paused"))
-        assert not session.may_step()
-        visitor.send("training", do="step")
-        until(session.may_step)
-        visitor.send("share", share=7.0)
-        until(lambda: session.share == 0.95)
-        visitor.send("training", do="resume")
-        until(lambda: not session.paused and not visitor.told["training"]["paused"])
-        other.pictures(0.2)
-        assert other.told["training"]["share"] == 0.95
-        assert not other.told["training"]["paused"]
-        watched.step()
-        seen = {}
-        for mode in ("color", "depth", "points"):
-            visitor.display(mode=mode)
-            before = visitor.shown
-            until(lambda before=before: visitor.shown > before + 1)
-            seen[mode] = visitor.jpeg
-        assert len(set(seen.values())) == 3
 
 
 def test_few_images_are_rendered_while_none_is_sent(watched, monkeypatch):

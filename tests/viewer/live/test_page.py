@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from websockets.exceptions import InvalidStatus
 
 from snowsplat.data import Dataset, load_dataset
 from snowsplat.scene.gaussians import Gaussians
@@ -69,20 +68,6 @@ def test_what_is_served(viewer):
             assert used.removeprefix("./") in names, (name, used)
     for name in ("live", "page", "../viewer.py", "main.js/", "."):
         assert status(get(viewer.url, path(viewer.url) + name)) == 404, name
-
-
-def test_only_the_page_may_connect(viewer):
-    root = viewer.url[: viewer.url.rindex("/", 0, -1) + 1]
-    with Visitor(viewer.url, origin=root.rstrip("/")) as visitor:
-        assert visitor.wait_for("scene")["title"] == "a <scene>"
-    for url, options in (
-        (root, {}),
-        (f"{viewer.url}x/", {}),
-        (viewer.url, {"origin": "http://evil.example"}),
-    ):
-        with pytest.raises(InvalidStatus) as error:
-            Visitor(url, **options)
-        assert error.value.response.status_code in (403, 404)
 
 
 def test_invalid_messages_are_ignored(viewer, dataset, capfd, caplog):
