@@ -129,6 +129,16 @@ def test_what_the_photos_are_in_chinese(studio, forked, tmp_path):
         assert not page.errors
 
 
+def test_a_text_is_no_scene(studio, tmp_path):
+    (tmp_path / "notes.txt").write_text("no photo")
+    with Browser(640, 480, frames=2.0) as browser:
+        page = browser.open(studio.server.url)
+        page.wait_for("!!document.querySelector('.drop')")
+        drop(page, tmp_path / "notes.txt")
+        page.wait_for("document.getElementById('notice').textContent.includes('drop photos')")
+    assert studio.ask("scenes") == (200, [])
+
+
 def test_a_finished_scene_is_opened_in_place_of_photos(studio, forked, tmp_path):
     box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     given = tmp_path / "chair.spz"

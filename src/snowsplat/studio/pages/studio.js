@@ -6,6 +6,9 @@ import { upload } from "./scene_upload.js";
 import { chosenLanguage, chosenTheme, say, speak } from "./text.js";
 import { chosen, dropped, titleOf } from "./upload.js";
 
+// Documents and programs: a scene of nothing else would have no photos.
+const NO_PHOTO = /\.(txt|md|pdf|docx?|xlsx?|pptx?|odt|csv|html?|css|js|py|ipynb|exe|dmg|msi)$/i;
+
 const main = /** @type {HTMLElement} */ (document.getElementById("main"));
 let closing = new AbortController();
 
@@ -85,6 +88,10 @@ function picked(/** @type {Event} */ event) {
 
 async function begin(/** @type {import("./upload.js").Item[]} */ items) {
     if (!items.length) return;
+    if (items.every(item => NO_PHOTO.test(item.path))) {
+        notice(say("no_photos"));
+        return;
+    }
     try {
         const { name } = await ask("scenes", "POST", { title: titleOf(items) });
         upload(name, items);

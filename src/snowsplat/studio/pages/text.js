@@ -69,6 +69,10 @@ const TEXTS = {
         "The studio does not answer; if it has ended or was started again, run: snowsplat studio, and use the page that it opens.",
         "工作室没有响应；如果它已结束或已重新启动，请运行 snowsplat studio，并使用它打开的页面。",
     ],
+    no_photos: [
+        "These files are no photos, no video and no scene; drop photos.",
+        "这些文件不是照片、视频或场景；请拖入照片。",
+    ],
     looking: ["Looking at the photos …", "正在检查照片……"],
     photos: ["Photos", "照片"],
     videos: ["Videos", "视频"],

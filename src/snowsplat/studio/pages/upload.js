@@ -46,11 +46,13 @@ export function chosen(files) {
         .filter(item => !item.path.split("/").some(name => name.startsWith(".")));
 }
 
-/** A title for what was dropped: that of the folder, or of a single file. */
+/** A title for what was dropped: that of the folder or of a single file, else the date of the first one. */
 export function titleOf(/** @type {Item[]} */ items) {
     const first = items[0].path.split("/");
     if (first.length > 1) return first[0];
-    return items.length === 1 ? first[0].replace(/\.[^.]+$/, "") : "";
+    if (items.length === 1) return first[0].replace(/\.[^.]+$/, "");
+    const date = new Date(timeOf(items[0].file));
+    return new Date(date.getTime() - 60000 * date.getTimezoneOffset()).toISOString().slice(0, 10);
 }
 
 /** When a file was changed last: milliseconds since 1970. */
