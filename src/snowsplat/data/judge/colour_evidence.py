@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from snowsplat.data.judge.photo_sample import PhotoSample
 from snowsplat.data.judge.rig import Rig
 
 # Points that are projected, and those among which neighbours are sought.
@@ -20,9 +21,9 @@ _CELLS = 48
 # a standard deviation below 0.03; surfaces have 0.5 and more.
 _NEIGHBOURS = 0.2
 _NEIGHBOUR_QUERIES = 500
-# A view agrees if the colours of the points fit its photo better than nearly all other pictures:
-# at most this share of them fits as well.
-_OTHERS = 0.15
+# A view agrees if at most this share of other pictures fits the colours of its points as well. So
+# this is the probability that it agrees if the poses are wrong. The other one: if they are right.
+_OTHERS, _AGREES = 0.15, 0.9
 
 
 @dataclass(frozen=True)
@@ -32,27 +33,31 @@ class Agreement:
     Attributes:
         correlation: between the colours of points and pixels, the mean over the views.
         judged: number of views that see enough points.
-        agreeing: share of the judged views that the colours fit better than they fit other photos,
-            or the same photo flipped. About 0.15 by chance.
+        odds: nats; how much more probable the colours are than if cameras and points said nothing.
+            A view agrees if its points fit its photo better than nearly all other photos, or the
+            same photo flipped.
+        odds_of_all: the same, if the points should be in all views: one that sees too few does not
+            agree.
     """
 
     correlation: float
     judged: int
-    agreeing: float
+    odds: float
+    odds_of_all: float
 
 
 class ColourEvidence:
     """The colours of points against those of photos.
 
     Args:
-        sample: the photos.
+        photos: (4, h, w) uint8 RGBA each, in order.
         xyz: (P, 3) points in the world frame.
         rgb: (P, 3) uint8, their colours.
     """
 
-    def __init__(self, sample: PhotoSample, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    def __init__(self, photos: Sequence[np.ndarray], xyz: np.ndarray, rgb: np.ndarray) -> None:
         chosen = np.random.default_rng(0).permutation(len(xyz))[:_MOST_POINTS]
-        self.sample = sample
+        self.photos = photos
         self.xyz = xyz[chosen].astype(np.float64)
         self.rgb = rgb[chosen].astype(np.float32)
 
@@ -72,7 +77,7 @@ class ColourEvidence:
         """The mean correlation over the views; a view that sees too few points counts as 0.
 
         Args:
-            rig: cameras of the views of the sample.
+            rig: the cameras of the photos.
             points: (3, 3), a linear map of the points.
             most: number of points that are projected; 0: all.
         """
@@ -83,26 +88,23 @@ class ColourEvidence:
     def agreement(self, rig: Rig, points: np.ndarray | None = None) -> Agreement:
         """See `Agreement`; the arguments are those of `correlation`."""
         found = self._visible(rig, points, 0)
-        own, agreeing = [0.0] * len(found), []
+        own, odds = [0.0] * len(found), []
         for i, seen in enumerate(found):
             if len(seen[0]) < _FEWEST_SEEN:
                 continue
             own[i] = self._fit(i, i, seen)
-            others = [
-                self._fit(i, j, seen)
-                for j in range(len(found))
-                if self.sample.groups[i] != self.sample.groups[j]
-            ]
+            # The photos before and after it may look alike.
+            others = [self._fit(i, j, seen) for j in range(len(found)) if abs(i - j) > 1]
             index, where = seen
             for flip in ((1, 0), (0, 1), (1, 1)):
                 flipped = np.abs(np.array(flip) - where)
                 others.append(self._fit(i, i, (index, flipped)))
-            agreeing.append(float(np.mean(np.array(others) >= own[i]) <= _OTHERS))
-        return Agreement(
-            float(np.mean(own)) if own else 0.0,
-            len(agreeing),
-            float(np.mean(agreeing)) if agreeing else 0.0,
-        )
+            agrees = np.mean(np.array(others) >= own[i]) <= _OTHERS
+            right, wrong = (_AGREES, _OTHERS) if agrees else (1 - _AGREES, 1 - _OTHERS)
+            odds.append(math.log(right / wrong))
+        blind = (len(found) - len(odds)) * math.log((1 - _AGREES) / (1 - _OTHERS))
+        mean = float(np.mean(own)) if own else 0.0
+        return Agreement(mean, len(odds), sum(odds) if odds else blind, sum(odds) + blind)
 
     def _visible(
         self, rig: Rig, points: np.ndarray | None, most: int
@@ -124,7 +126,7 @@ class ColourEvidence:
     def _fit(self, view: int, photo: int, seen: tuple[np.ndarray, np.ndarray]) -> float:
         """The correlation of the points that ``view`` sees with a photo at the same positions."""
         index, where = seen
-        picture = self.sample.photos[photo]
+        picture = self.photos[photo]
         height, width = picture.shape[1:]
         column = np.minimum((where[:, 0] * width).astype(np.int64), width - 1)
         row = np.minimum((where[:, 1] * height).astype(np.int64), height - 1)

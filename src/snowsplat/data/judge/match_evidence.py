@@ -1,44 +1,98 @@
-"""`MatchEvidence`: do the same things in two photos lie where both cameras can see one point?"""
+"""`MatchEvidence`: how probable poses make the matches between the photos, in nats.
+
+A pair of photos is verified if enough of its matches agree with one epipolar geometry, whichever it
+is. Its evidence is Σ log(ε + (1 − ε) r(d)) over its matches (`snowsplat.scene.epipolar`): positive
+if the matches are where the poses say, and negative if they are anywhere. The matches of a pair are
+not independent: a verified pair may be false as a whole (two places that look alike), and it may
+agree with wrong poses by chance. The evidence of a pair is bounded by the odds of the two.
+"""
 
 from __future__ import annotations
 
+import math
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
+from typing import TypeVar
 
 import cv2
 import numpy as np
 
-from snowsplat.data.judge.photo_sample import PhotoSample
+from snowsplat.data.dataset import View
 from snowsplat.data.judge.rig import Rig
+from snowsplat.data.photos.decode import load_thumbnail
+from snowsplat.scene.epipolar import LEAST_FALSE, distances_of_matches, likelihood, log_odds
+from snowsplat.util.errors import UserError
 
+SIDE = 320  # pixels of the longer side of the copies of photos
+_MOST_VIEWS = 256  # that are looked at, spread over larger datasets
+SPREAD = 24  # views of which all pairs are matched
+_AROUND = 3  # views before and after each in the order of names, and nearest ones by pose
 _FEATURES = 500  # of each photo
 _RATIO = 0.8  # of the distances to the best and the second best feature, as in Lowe's paper
-# Matches of a pair that agree with one epipolar geometry, whichever it is. Seven matches define
-# one, so a few more agree by chance.
-_FEWEST_MATCHES = 25
-_MOST_PAIRS = 24
-# Relative to the longer side. What stays at its place is fixed to the frame (a time stamp) or to
-# a tripod, and says nothing about the poses.
-_MOVED = 0.01
+# A pair is verified if more matches agree than this and a share of all (Brown and Lowe 2007).
+_FEWEST_MATCHES, _OF_MATCHES = 8, 0.3
 _RANSAC_PIXELS = 1.5
-# Distance from the epipolar line, relative to the longer side.
-_NEAR = 0.01
-# Radians between two rays. Depths of points with less parallax are noise.
-_PARALLAX = 0.01
+# Relative to the longer side. What stays at its place is fixed to the frame (a time stamp) or to
+# a tripod, and says nothing about the poses. σ is no larger: such poses are of no use.
+_MOVED = _MOST_NOISE = 0.01
+# Probabilities that a verified pair contradicts right poses, and that it agrees with wrong ones. Of
+# 1,044 pairs of six captures 0.2% did; with shuffled poses, 2 to 17% (docs/cameras.md).
+_FALSE, _BY_CHANCE = 0.01, 0.05
+_LEAST_NATS = math.log(_FALSE / (1 - _BY_CHANCE))
+_MOST_NATS = math.log((1 - _FALSE) / _BY_CHANCE)
+# The share of frames with wrong poses that is expected, and the odds at which one is told.
+_WRONG, _CERTAIN = 0.01, 10.0
+_PIXELS = 1600.0  # of the longer side, for `likelihood`
+
+_In, _Out = TypeVar("_In"), TypeVar("_Out")
+
+
+@dataclass(frozen=True)
+class PhotoSample:
+    """Small copies of photos of a dataset.
+
+    Attributes:
+        views: their indices in the dataset, sorted.
+        photos: (4, h, w) uint8 RGBA each. Masks are not applied: what is moving in a few photos
+            misleads no witness, and a mask may be wrong.
+    """
+
+    views: list[int]
+    photos: list[np.ndarray]
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> PhotoSample:
+        """Decode photos: pairs of neighbours, if there are many. Those that are damaged are not
+        used."""
+        chosen = np.arange(len(views))
+        if len(views) > _MOST_VIEWS:
+            first = np.linspace(0, len(views) - 2, _MOST_VIEWS // 2).round().astype(int)
+            chosen = np.unique([first, first + 1])
+        decoded = _in_threads(_photo, [views[i] for i in chosen])
+        kept = [(int(i), p) for i, p in zip(chosen, decoded, strict=True) if p is not None]
+        return cls([i for i, _ in kept], [photo for _, photo in kept])
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def spread(self) -> list[int]:
+        """Some of the views, by their index in the sample."""
+        every = np.linspace(0, len(self) - 1, min(len(self), SPREAD)).round().astype(int)
+        return [int(i) for i in np.unique(every)]
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two views of the sample, and matches (N, 2) relative to the sizes of their photos.
-
-    ``moved``: the share of all their matches that are not at the same place in both photos.
-    """
+    """Two views of the sample, and matches (N, 2) relative to the sizes of their photos."""
 
     a: int
     b: int
     in_a: np.ndarray
     in_b: np.ndarray
-    moved: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -46,63 +100,149 @@ class Fit:
     """How well cameras explain the matches of each pair.
 
     Attributes:
-        shares: (pairs,) the share of the matches that both cameras see as one point in front of
-            them, within 1% of the size of the photo.
-        medians: (pairs,) the median distance of the matches from their epipolar lines, relative to
-            the longer side; infinite if most of them are behind a camera.
+        a, b: (pairs,) the views of each.
+        nats: (pairs,) the evidence for the poses, unbounded.
+        noise: σ, the distance of the matches from their epipolar lines, relative to the longer
+            side.
     """
 
-    shares: np.ndarray
-    medians: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    nats: np.ndarray
+    noise: float
+
+    def odds(self, other: Fit | None = None) -> float:
+        """In nats: how much more probable these cameras are than others; None: than those that say
+        nothing."""
+        return float(_bounded(self.nats if other is None else self.nats - other.nats).sum())
 
     @property
-    def share(self) -> float:
-        """The median over the pairs."""
-        return float(np.median(self.shares))
+    def agreeing(self) -> float:
+        """The share of the pairs whose matches agree with the poses."""
+        return float(np.mean(self.nats > 0))
 
-    @property
-    def median(self) -> float:
-        """The median over the pairs."""
-        return float(np.median(self.medians))
+    def doubtful(self, count: int) -> list[int]:
+        """The views, of ``count``, that have no pair, or less evidence for than against them."""
+        nats = _bounded(self.nats)
+        evidence = np.bincount(self.a, nats, count) + np.bincount(self.b, nats, count)
+        return [int(i) for i in np.flatnonzero(evidence <= 0)]
+
+    def wrong(self, count: int) -> list[int]:
+        """The views, of ``count``, whose poses are wrong if those of the others are right.
+
+        The set of wrong views is the most probable one, as far as a greedy search finds it: pairs
+        of right ones have their evidence, other pairs have none, and each wrong view costs the
+        logarithm of its prior odds. A view that agrees with no right one tells nothing about
+        others: it may be wrong itself.
+        """
+        cost = math.log((1 - _WRONG) / _WRONG * _CERTAIN)
+        nats = _bounded(self.nats)
+        right = np.ones(count, bool)
+        ends = (self.a, self.b), (self.b, self.a)
+        for _ in range(2 * count):
+            agree = (nats > 0) & right[self.a] & right[self.b]
+            confirmed = np.zeros(count, bool)
+            confirmed[self.a[agree]] = confirmed[self.b[agree]] = True
+            evidence = np.zeros(count)
+            for own, other in ends:
+                tells = right[other] & ((nats > 0) | confirmed[other])
+                evidence += np.bincount(own, nats * tells, count)
+            gain = np.where(right, -1.0, 1.0) * (evidence + cost)
+            best = int(gain.argmax())
+            if gain[best] <= 0:
+                break
+            right[best] = not right[best]
+        return [int(i) for i in np.flatnonzero(~right)]
 
 
 class MatchEvidence:
-    """Matches between the photos of a sample that agree with a rigid scene, without its poses."""
+    """Matches between the photos of a sample that agree with a rigid scene, without its poses.
 
-    def __init__(self, sample: PhotoSample) -> None:
+    Pairs are made of views that follow each other and of those that are close by pose; of all, if
+    there are few.
+    """
+
+    def __init__(self, sample: PhotoSample, rig: Rig) -> None:
         self._sample = sample
-        self.widened = False
-        self._features = [_features(photo) for photo in sample.photos]
-        #: The pairs with enough matches, within the groups of the sample.
-        self.pairs = self._match_pairs(same_group=True)
+        self._features = _in_threads(_features, sample.photos)
+        self._tried: set[tuple[int, int]] = set()
+        self.pairs: list[Pair] = []
+        count = len(sample)
+        if count <= SPREAD:
+            self._add(combinations(range(count), 2))
+        else:
+            self._add((i, i + step) for step in range(1, _AROUND + 1) for i in range(count - step))
+            self._add(_near_by_pose(rig))
 
-    def widen(self) -> None:
-        """Add pairs of different groups. If the names are shuffled, views of one group do not see
-        the same things, but others do.
-        """
-        self.widened = True
-        self.pairs += self._match_pairs(same_group=False)
+    def widen(self, views: Iterable[int]) -> None:
+        """Add the pairs of these views with others, wherever they are said to be."""
+        self._add((view, other) for view in views for other in self._sample.spread())
 
-    def _match_pairs(self, *, same_group: bool) -> list[Pair]:
-        groups, near = self._sample.groups, self._sample.near
-        candidates = [
-            Pair(a, b, *_matches(self._features[a], self._features[b]))
-            for a, b in combinations(range(len(groups)), 2)
-            if (groups[a] == groups[b] or (a, b) in near) == same_group
-        ]
-        candidates.sort(key=lambda pair: -len(pair.in_a))
-        chosen = candidates[:_MOST_PAIRS]
-        chosen += [pair for pair in candidates[_MOST_PAIRS:] if (pair.a, pair.b) in near]
-        rigid = (_rigid(pair, self._sample) for pair in chosen)
-        return [pair for pair in rigid if len(pair.in_a) >= _FEWEST_MATCHES]
+    def fit(self, rig: Rig, pairs: Sequence[Pair] | None = None) -> Fit:
+        """How well cameras of the views of the sample explain the matches of (all) pairs."""
+        pairs = self.pairs if pairs is None else pairs
+        parts = [_distances(pair, rig) for pair in pairs]
+        distances = _PIXELS * np.concatenate([*parts, np.empty(0)])
+        sides = np.full(len(distances), _PIXELS)
+        noise = 0.0
+        nats = np.empty(0)
+        if pairs:
+            noise = min(likelihood(distances, sides)[1], _MOST_NOISE * _PIXELS)
+            each = log_odds(distances, sides, noise, LEAST_FALSE)
+            nats = np.add.reduceat(each, np.cumsum([0, *map(len, parts[:-1])]))
+        a, b = (np.array([pair[k] for pair in ((p.a, p.b) for p in pairs)], int) for k in (0, 1))
+        return Fit(a, b, nats, noise / _PIXELS)
 
-    def fit(self, rig: Rig) -> Fit:
-        """How well cameras of the views of the sample explain the matches; see `Fit`."""
-        distances = [_distances(pair, rig) for pair in self.pairs]
-        return Fit(
-            np.array([np.mean(d < _NEAR) for d in distances]),
-            np.array([np.median(d) for d in distances]),
-        )
+    @cached_property
+    def spread(self) -> list[Pair]:
+        """A few of the pairs: for each of the spread views, that with the most matches."""
+        chosen = {}
+        for view in self._sample.spread():
+            own = [pair for pair in self.pairs if view in (pair.a, pair.b)]
+            if own:
+                best = max(own, key=lambda pair: len(pair.in_a))
+                chosen[best.a, best.b] = best
+        return list(chosen.values())
+
+    def _add(self, candidates: Iterable[tuple[int, int]]) -> None:
+        new = {(min(both), max(both)) for both in candidates if both[0] != both[1]} - self._tried
+        self._tried |= new
+        self.__dict__.pop("spread", None)
+        matched = _in_threads(lambda both: self._verified(*both), sorted(new))
+        self.pairs += [pair for pair in matched if pair is not None]
+
+    def _verified(self, a: int, b: int) -> Pair | None:
+        sizes = [self._sample.photos[i].shape[:0:-1] for i in (a, b)]
+        found = _pair_matches(self._features[a], self._features[b], sizes)
+        return None if found is None else Pair(a, b, *found)
+
+
+def _bounded(nats: np.ndarray) -> np.ndarray:
+    return nats.clip(_LEAST_NATS, _MOST_NATS)
+
+
+def _in_threads(function: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
+    workers = min(4, os.cpu_count() or 1)
+    with ThreadPoolExecutor(workers, thread_name_prefix="snowsplat-judge") as pool:
+        return list(pool.map(function, items))
+
+
+def _photo(view: View) -> np.ndarray | None:
+    try:
+        return load_thumbnail(view.image, SIDE)
+    except UserError:  # the training says so, or leaves the photo out
+        return None
+
+
+def _near_by_pose(rig: Rig) -> Iterable[tuple[int, int]]:
+    """Each view with those that are nearest in position and viewing direction."""
+    positions = rig.positions - rig.positions.mean(0)
+    spread = max(float(np.linalg.norm(positions, axis=1).max()), 1e-30)
+    where = np.hstack([positions / spread, rig.rotation[:, 2]])
+    for i, own in enumerate(where):
+        distance = np.linalg.norm(where - own, axis=1)
+        distance[i] = np.inf
+        yield from ((i, int(j)) for j in np.argsort(distance, kind="stable")[:_AROUND])
 
 
 def _features(photo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,61 +259,49 @@ def _features(photo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return where, np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
 
 
-def _matches(
-    a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """The positions (N, 2) in both photos of features that are each other's best match."""
-    if min(len(a[0]), len(b[0])) < 2:
-        return np.empty((0, 2)), np.empty((0, 2))
+def _pair_matches(
+    a: tuple[np.ndarray, np.ndarray],
+    b: tuple[np.ndarray, np.ndarray],
+    sizes: Sequence[Sequence[int]],
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The positions (N, 2) in both photos of features that are each other's best match, that move,
+    and that agree with one epipolar geometry; None: too few."""
+    if min(len(a[0]), len(b[0])) < _FEWEST_MATCHES:
+        return None
     similar = a[1] @ b[1].T
     best = similar.argmax(1)
     rows = np.arange(len(best))
     mutual = similar.argmax(0)[best] == rows
     first = similar[rows, best]
     similar[rows, best] = -1.0
-    second = similar.max(1)
-    distinct = 2 - 2 * first < _RATIO**2 * (2 - 2 * second)
-    kept = mutual & distinct
-    return a[0][kept], b[0][best[kept]]
-
-
-def _rigid(pair: Pair, sample: PhotoSample) -> Pair:
-    """The matches that move and that agree with one epipolar geometry."""
-    moved = np.abs(pair.in_a - pair.in_b).max(1) > _MOVED
-    in_a, in_b = pair.in_a[moved], pair.in_b[moved]
-    agree = np.zeros(len(in_a), bool)
-    if len(in_a) >= _FEWEST_MATCHES:
-        sizes = [sample.photos[i].shape[:0:-1] for i in (pair.a, pair.b)]
-        cv2.setRNGSeed(0)
-        _, mask = cv2.findFundamentalMat(
-            in_a * sizes[0], in_b * sizes[1], cv2.FM_RANSAC, _RANSAC_PIXELS, 0.99, 500
-        )
-        agree = agree if mask is None else mask[:, 0] > 0
-    share = float(moved.mean()) if len(moved) else 0.0
-    return Pair(pair.a, pair.b, in_a[agree], in_b[agree], share)
+    distinct = 2 - 2 * first < _RATIO**2 * (2 - 2 * similar.max(1))
+    in_a, in_b = a[0], b[0][best]
+    kept = mutual & distinct & (np.abs(in_a - in_b).max(1) > _MOVED)
+    if kept.sum() < _FEWEST_MATCHES:
+        return None
+    in_a, in_b = in_a[kept], in_b[kept]
+    cv2.setRNGSeed(0)
+    _, mask = cv2.findFundamentalMat(
+        in_a * sizes[0], in_b * sizes[1], cv2.FM_RANSAC, _RANSAC_PIXELS, 0.99, 500
+    )
+    agree = np.zeros(len(in_a), bool) if mask is None else mask[:, 0] > 0
+    is_verified = agree.sum() > _FEWEST_MATCHES + _OF_MATCHES * len(agree)
+    return (in_a[agree], in_b[agree]) if is_verified else None
 
 
 def _distances(pair: Pair, rig: Rig) -> np.ndarray:
-    """(N,) distances from the epipolar lines; infinite for points behind a camera."""
-    a, b = rig.rays(pair.a, pair.in_a), rig.rays(pair.b, pair.in_b)
+    """(N,) distances of the matches from their epipolar lines, relative to the longer side of the
+    photos; infinite for points behind a camera. If both cameras are at one place, the distances
+    from the points that their rotation says."""
+    one, two = rig.rays(pair.a, pair.in_a), rig.rays(pair.b, pair.in_b)
     rotation = rig.rotation[pair.b] @ rig.rotation[pair.a].T
     baseline = rig.translation[pair.b] - rotation @ rig.translation[pair.a]
     if np.linalg.norm(baseline) <= 1e-9 * np.linalg.norm(rig.translation[pair.b]):
-        baseline = np.array([1.0, 0.0, 0.0])  # at one place there is no parallax in any direction
-    turned = a @ rotation.T  # the rays of the first camera, in the frame of the second
-    normal = np.cross(baseline, turned)  # of the epipolar plane; its line in the second photo
-    back = np.cross(baseline, b) @ rotation  # the same in the first photo, up to the sign
-    # Sampson's distance, a first-order distance from the epipolar line, in relative pixels.
-    scale_a = rig.focal[pair.a] * rig.aspect[pair.a]
-    scale_b = rig.focal[pair.b] * rig.aspect[pair.b]
-    gradient = ((normal[:, :2] / scale_b) ** 2).sum(1) + ((back[:, :2] / scale_a) ** 2).sum(1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.abs((normal * b).sum(1)) / np.sqrt(gradient)
-    # Depths along both rays: z_b b = z_a turned + baseline, multiplied by each ray.
-    across = np.cross(turned, b)
-    area = (across**2).sum(1)
-    depth_a = (np.cross(b, baseline) * across).sum(1)
-    depth_b = (np.cross(turned, baseline) * across).sum(1)
-    parallax = np.sqrt(area) / (np.linalg.norm(turned, axis=1) * np.linalg.norm(b, axis=1))
-    front = (parallax < _PARALLAX) | ((depth_a > 0) & (depth_b > 0))
-    return np.where(front & np.isfinite(distance), distance, np.inf)
+        turned = np.column_stack([one, np.ones(len(one))]) @ rotation.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.linalg.norm(turned[:, :2] / turned[:, 2:] - two, axis=1)
+        distance = np.where(turned[:, 2] > 0, distance, np.inf)
+    else:
+        distance = distances_of_matches(rotation, baseline, one, two)
+    scale = np.mean([rig.focal[i] * rig.aspect[i] for i in (pair.a, pair.b)])
+    return np.where(np.isfinite(distance), scale * distance, np.inf)

@@ -81,6 +81,5 @@ class Rig:
         return seen, where[seen], depth[seen]
 
     def rays(self, view: int, where: np.ndarray) -> np.ndarray:
-        """(N, 3) directions in the camera frame, with z = 1, of positions in the photo (N, 2)."""
-        xy = (where - self.centre[view]) / self.focal[view]
-        return np.column_stack([xy, np.ones(len(xy))])
+        """(N, 2) in the normalised image plane, of positions in the photo (N, 2)."""
+        return np.asarray((where - self.centre[view]) / self.focal[view])

@@ -3,19 +3,23 @@
 Four witnesses are heard, as far as the dataset has them:
 
 - the numbers: lenses, positions (`lens_check`);
+- the photos: how probable do the poses make the matches between them (`MatchEvidence`)?
 - the points: have they the colours of the photos where the cameras see them (`ColourEvidence`)?
-- the photos: do matches between them agree with the poses (`MatchEvidence`)?
-- the tracks: are the points where they were observed (`track_fit`)?
+- the tracks: are the points where they were observed (`tracks_off`)?
 
-Each witness is first asked whether it can tell: points at random positions and photos without
-matches say nothing. If a witness contradicts the cameras, the usual mistakes are tried (`repairs`).
-The cameras are impossible only if another explanation fits what they do not fit.
+The evidence is in nats: the logarithm of how much more probable the photos are with the given
+cameras than with cameras that say nothing. Photos without matches and points at random positions
+add nothing. Each frame is judged by its own matches, and the usual mistakes (`repairs`) are
+compared with the given cameras in the same unit. The cameras are impossible only if the odds are
+overwhelming.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,47 +28,42 @@ from snowsplat.data.judge.colour_evidence import Agreement, ColourEvidence
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.lens_check import lens_findings
 from snowsplat.data.judge.mask_check import mask_findings
-from snowsplat.data.judge.match_evidence import Fit, MatchEvidence
-from snowsplat.data.judge.photo_sample import PhotoSample
-from snowsplat.data.judge.repairs import Repair, point_repairs, pose_repairs, zooms
+from snowsplat.data.judge.match_evidence import Fit, MatchEvidence, PhotoSample
+from snowsplat.data.judge.repairs import Repair, point_repairs, pose_repairs
 from snowsplat.data.judge.rig import Rig
-from snowsplat.data.judge.track_evidence import TrackFit, track_fit
+from snowsplat.data.judge.track_evidence import tracks_off
 from snowsplat.scene.origin import HERE
 from snowsplat.util.names import first_names
 from snowsplat.util.natural_order import natural_key
 
-# Colours: the share of views that agree. 0.15 by chance, 0.9 to 1 for right poses.
-_COLOURS_AGREE = 0.6
-_COLOURS_CONTRADICT = 0.35
-# A correlation above this is none of chance. Photos that look alike may agree no less with others.
-_COLOURS_FIT = 0.4
-# Matches: pairs that are needed, and the share of matches that agree. 0 to 0.4 for wrong poses
-# (0.4 if the cameras nearly look in one direction), 0.9 to 1 for exact ones.
-_FEWEST_PAIRS = 3
-_PAIRS_FOR_PROOF = 6
-_MATCHES_AGREE = 0.5
-_MATCHES_PROVE = 0.8
-_MATCHES_CONTRADICT = 0.15
-# A pair contradicts the poses if nearly none of its matches agree. Some pairs do in scenes that
-# repeat themselves; poses that lost digits are wrong in about half of the pairs.
-_PAIRS_CONTRADICT = 0.3
-# A repair must improve the correlation of colours by this, or the share of matches by twice this.
-_BETTER = 0.2
+# Nats. Odds of 10^4 are told; odds of 10^8 are overwhelming.
+_TOLD, _OVERWHELMING = math.log(1e4), math.log(1e8)
+# Wrong poses of at most this share of the frames are those of single frames.
+_MINORITY = 1 / 3
+# Typical distance of matches from where the poses say, relative to the longer side: 5 pixels of
+# 1000 are visible in a training. Poses by structure from motion have 0.0008 to 0.0013.
+_INEXACT = 0.005
+# Nats for each match by which two repairs differ that are the same mistake, apart from rounding.
+_EQUAL = 0.05
+# A correlation of colours above this is none of chance; a change of the points improves it by this.
+_COLOURS_FIT, _BETTER = 0.4, 0.2
 # Points that are projected to try a repair.
 _POINTS_TO_TRY = 2000
-# Another focal length must divide the distances of matches by this, in the median of the pairs.
-_SHARPER = 2.0
 
 # Distance of the scene from the origin, relative to the extent of the cameras. Kernels compute in
 # float32, with a relative error of 6e-8. At a distance of 2000 extents this is a tenth of a pixel
 # of a photo with 1000 pixels; at 50,000 it is some pixels.
 _ROUNDED, _LOST = 2e3, 5e4
+_LOST_DIGITS = (
+    "the poses were too far from the origin, and lost digits; move the scene to the origin in the "
+    "program that made the poses, and export it again"
+)
 
 
 def judge(dataset: Dataset) -> list[Finding]:
     """What is impossible or doubtful about the cameras and masks of a dataset; empty if nothing is.
 
-    Decodes up to 24 photos and 16 masks at a small size. Takes less than a second for most.
+    Decodes up to 256 photos and 16 masks at a small size: about 50 ms of one core for each photo.
     """
     views = sorted([*dataset.train, *dataset.test], key=lambda view: natural_key(view.name))
     masks = mask_findings(views, dataset.points)
@@ -72,7 +71,12 @@ def judge(dataset: Dataset) -> list[Finding]:
     lenses, positions = _lenses(views), _positions(rig)
     if any(finding.impossible for finding in lenses):
         return [*lenses, *masks]
-    poses = _poses(views, rig, dataset.points, far=dataset.origin != HERE)
+    evidence = _Evidence.of(views, rig, dataset.points, far=dataset.origin != HERE)
+    poses = _poses(evidence)
+    if not poses and max(evidence.odds, evidence.seen) <= _TOLD:
+        # Only the tracks say anything.
+        count, off = tracks_off(views, rig, dataset.points)
+        poses = [_tracks(count, off, far=evidence.far)] if len(off) > _MINORITY * count else []
     # Wrong poses may have any positions; what is wrong with the poses says more.
     return [*lenses, *poses, *([] if poses else positions), *masks]
 
@@ -121,220 +125,153 @@ def _positions(rig: Rig) -> list[Finding]:
     return []
 
 
-def _poses(views: list[View], rig: Rig, points: Points | None, *, far: bool) -> list[Finding]:
-    sample = PhotoSample.of(views, rig)
-    tracks = track_fit(views, rig, points)
-    if len(sample) < 2:
-        return [] if tracks is None else [tracks.finding(impossible=far)]
-    rig = rig.select(sample.views)
-    colours, agreement = None, None
-    if points is not None:
-        colours = ColourEvidence(sample, points.xyz.numpy(), points.rgb.numpy())
-        agreement = colours.agreement(rig) if colours.informative() else None
-    coloured = agreement is not None and _agrees(agreement, len(sample))
-    matches = MatchEvidence(sample)
-    fit = _fit(rig, matches)
-    if not coloured and (fit is None or fit.share < _MATCHES_AGREE):
-        matches.widen()
-        fit = _fit(rig, matches)
-    if coloured:
-        found = []
-    elif colours is None or agreement is None:
-        found = [] if fit is None else _by_matches(rig, matches, fit)
-    elif fit is None:
-        found = _by_colours(rig, colours, agreement)
-    elif fit.share >= _MATCHES_AGREE:
-        found = _points(rig, colours, agreement)
-    else:
-        found = _by_both(rig, colours, agreement, matches, fit)
-    if any(finding.impossible for finding in found) or (found and tracks is None):
-        return found
-    if fit is not None and (fit.shares < _MATCHES_CONTRADICT).any() and not matches.widened:
-        matches.widen()
-        fit = matches.fit(rig)
-    if fit is not None and not far:
-        for wrong, text in (
-            (_lost(rig, matches, fit), "contradict their matches with all other photos"),
-            (_frozen(rig, matches, fit), "are those of other photos, which show other places"),
-        ):
-            if wrong:
-                photos = tuple(views[sample.views[i]].name for i in wrong)
-                text = f"the poses of {first_names(photos, 5)} {text}; a training leaves them out"
-                found = [*found, Finding("poses", text, photos=photos)]
-        if any(finding.photos for finding in found):
-            return found
-    return _inexact(fit, tracks, far=far)
+@dataclass(frozen=True)
+class _Evidence:
+    """What the witnesses say about some views of a dataset.
 
-
-def _lost(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[int]:
-    """The views of the sample none of whose pairs agrees, if the pairs of the others do. Two views
-    of one pose say nothing."""
-    pairs = [
-        ({pair.a, pair.b}, share)
-        for pair, share in zip(matches.pairs, fit.shares, strict=True)
-        if not np.array_equal(rig.translation[pair.a], rig.translation[pair.b])
-    ]
-    lost: set[int] = set()
-    while True:
-        pairs = [(both, share) for both, share in pairs if both.isdisjoint(lost)]
-        shares: dict[int, list[float]] = {}
-        for both, share in pairs:
-            for view in both:
-                shares.setdefault(view, []).append(share)
-        contradicted = {
-            view: float(np.median(each))
-            for view, each in shares.items()
-            if len(each) >= _FEWEST_PAIRS and max(each) < _MATCHES_AGREE
-        }
-        if not contradicted:
-            break
-        lost.add(min(contradicted, key=contradicted.__getitem__))
-    rest = [share for _, share in pairs]
-    proven = len(rest) >= _PAIRS_FOR_PROOF and np.median(rest) >= _MATCHES_PROVE
-    return sorted(lost) if proven and 2 * len(lost) < len(rig) else []
-
-
-def _frozen(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[int]:
-    """The views of the sample with the pose of another one that shows another place, and fits this
-    pose better. Trackers that were lost repeat a pose."""
-    same = [
-        np.array_equal(rig.translation[pair.a], rig.translation[pair.b])
-        and np.array_equal(rig.rotation[pair.a], rig.rotation[pair.b])
-        for pair in matches.pairs
-    ]
-    distances: dict[int, list[float]] = {}
-    for pair, equal, median in zip(matches.pairs, same, fit.medians, strict=True):
-        for view in () if equal else (pair.a, pair.b):
-            distances.setdefault(view, []).append(median)
-    typical = {
-        view: float(np.median(each))
-        for view, each in distances.items()
-        if len(each) >= _FEWEST_PAIRS
-    }
-    frozen = set()
-    for pair, equal in zip(matches.pairs, same, strict=True):
-        if equal and pair.moved >= _MATCHES_PROVE and {pair.a, pair.b} <= typical.keys():
-            right, wrong = sorted((pair.a, pair.b), key=typical.__getitem__)
-            if typical[wrong] >= _SHARPER * typical[right]:
-                frozen.add(wrong)
-    return sorted(frozen)
-
-
-def _inexact(fit: Fit | None, tracks: TrackFit | None, *, far: bool) -> list[Finding]:
-    """Poses of which some are right, or nearly right, so that no other witness has named them.
-
-    ``far``: the scene was far from the origin, where numbers lose digits.
+    Attributes:
+        names: of the views.
+        rig: their cameras.
+        spread: some of the views, by their indices, whose colours are compared.
+        matches, fit, wrong: of all pairs; the views whose own matches contradict their poses.
+        odds: nats, the evidence of a few pairs that are spread over the dataset.
+        colours, agreement: of the spread views; None if points say nothing.
+        far: the scene was far from the origin, where numbers lose digits.
     """
-    shares = np.ones(0) if fit is None else fit.shares
-    wrong = int((shares < _MATCHES_CONTRADICT).sum())
-    contradicted = wrong >= max(_FEWEST_PAIRS, _PAIRS_CONTRADICT * len(shares))
-    if tracks is not None:
-        return [tracks.finding(impossible=far or contradicted)]
-    if not contradicted:
-        return []
-    text = f"the matches of {wrong} of {len(shares)} pairs of photos contradict the poses"
-    if not far:
-        return [Finding("poses", f"{text}, so the poses of some photos are wrong")]
-    text += "; the poses were too far from the origin, and lost digits"
-    todo = "move the scene to the origin in the program that made the poses, and export it again"
-    return [Finding("poses", f"{text}; {todo}", impossible=True)]
+
+    names: list[str]
+    rig: Rig
+    spread: list[int]
+    matches: MatchEvidence
+    fit: Fit
+    wrong: list[int]
+    odds: float
+    colours: ColourEvidence | None
+    agreement: Agreement | None
+    far: bool
+
+    @classmethod
+    def of(cls, views: list[View], rig: Rig, points: Points | None, *, far: bool) -> _Evidence:
+        sample = PhotoSample.of(views)
+        rig = rig.select(sample.views)
+        matches = MatchEvidence(sample, rig)
+        fit = matches.fit(rig)
+        if doubtful := fit.doubtful(len(sample)):
+            few = len(doubtful) <= _MINORITY * len(sample)
+            matches.widen(doubtful if few else sample.spread())
+            fit = matches.fit(rig)
+        spread, colours, agreement = sample.spread(), None, None
+        if points is not None and len(sample) > 1:
+            photos = [sample.photos[i] for i in spread]
+            colours = ColourEvidence(photos, points.xyz.numpy(), points.rgb.numpy())
+            agreement = colours.agreement(rig.select(spread)) if colours.informative() else None
+        odds = matches.fit(rig, matches.spread).odds()
+        names = [views[i].name for i in sample.views]
+        wrong = fit.wrong(len(sample))
+        return cls(names, rig, spread, matches, fit, wrong, odds, colours, agreement, far)
+
+    @property
+    def minority(self) -> bool:
+        """Whether the wrong poses are those of single frames."""
+        return len(self.wrong) <= _MINORITY * len(self.names)
+
+    @property
+    def seen(self) -> float:
+        """The evidence of the colours."""
+        if self.agreement is None:
+            return 0.0
+        return self.agreement.odds if self.matches.pairs else self.agreement.odds_of_all
+
+    def repaired(self) -> list[Repair]:
+        """The repairs of poses and lenses that make the matches more probable, by odds that are
+        told; the most probable ones, which are equal."""
+        # Single frames with wrong poses are no mistake of all.
+        wrong = set(self.wrong) if self.minority else set()
+        pairs = [pair for pair in self.matches.spread if wrong.isdisjoint((pair.a, pair.b))]
+        given = self.matches.fit(self.rig, pairs)
+        found = []
+        for repair in pose_repairs(self.rig):
+            fit = self.matches.fit(repair.rig, pairs)
+            if fit.odds(given) > _TOLD and fit.odds() > _TOLD:
+                found.append((float(fit.nats.sum()), repair))
+        best = max((nats for nats, _ in found), default=0.0)
+        equal = _EQUAL * sum(len(pair.in_a) for pair in pairs)
+        return [repair for nats, repair in found if nats >= best - equal]
+
+    def best_by_colours(self, repairs: Iterable[Repair]) -> Repair | None:
+        """The repair with which the colours agree best; None if they do with none of them."""
+        if self.colours is None or self.agreement is None:
+            return None
+        best, best_value = None, max(self.agreement.correlation, 0.0) + _BETTER
+        for repair in repairs:
+            rig = repair.rig.select(self.spread)
+            value = self.colours.correlation(rig, repair.points, _POINTS_TO_TRY)
+            if value > best_value:
+                best, best_value = repair, value
+        if best is None:
+            return None
+        agreement = self.colours.agreement(best.rig.select(self.spread), best.points)
+        return best if agreement.odds - self.agreement.odds > _TOLD else None
 
 
-def _fit(rig: Rig, matches: MatchEvidence) -> Fit | None:
-    """None: too few photos match to say anything."""
-    return matches.fit(rig) if len(matches.pairs) >= _FEWEST_PAIRS else None
+def _poses(evidence: _Evidence) -> list[Finding]:
+    """What the matches and colours say about the poses, and about the frame of the points."""
+    texts = []
+    if evidence.fit.nats.size:
+        share = f"{evidence.fit.agreeing:.0%} of the pairs of photos"
+        away = f"typically {evidence.fit.noise:.2%} of their size away from where the poses say"
+        texts.append(f"the matches of {share} agree with the poses, {away}")
+    if evidence.agreement is not None and evidence.seen < 0:
+        texts.append(_of_colours(evidence.agreement))
+    because = ", and ".join(texts)
+    is_exact = evidence.fit.noise <= _INEXACT
+    matched = evidence.odds > 0 and is_exact
+    if repairs := evidence.repaired():
+        best = evidence.best_by_colours(repairs) or repairs[0]
+        return [_mistake(best, because, impossible=not matched)]
+    if evidence.seen < _TOLD and (matched or not evidence.matches.pairs):
+        poses = () if matched else pose_repairs(evidence.rig)
+        if repair := evidence.best_by_colours([*poses, *point_repairs(evidence.rig)]):
+            return [_mistake(repair, because, impossible=True)]
+    disorder = not matched and evidence.odds + evidence.seen < -_TOLD
+    if evidence.far and (disorder or not is_exact or not evidence.minority):
+        return [Finding("poses", f"{because}; {_LOST_DIGITS}", impossible=True)]
+    if disorder:
+        return [_disorder(because, impossible=evidence.odds < -_OVERWHELMING)]
+    if not is_exact:
+        text = f"{because}; the poses are inexact, or belong to other photos"
+        return [Finding("poses", text)]
+    found = [_frames(evidence)] if evidence.wrong else []
+    agreement = evidence.agreement
+    if agreement is not None and evidence.seen < -_TOLD and agreement.correlation < _COLOURS_FIT:
+        text = f"{_of_colours(agreement)}; the points may be in another frame than the poses"
+        found.append(Finding("points", text))
+    return found
 
 
-def _agrees(agreement: Agreement, views: int) -> bool:
-    return 2 * agreement.judged >= views and agreement.agreeing >= _COLOURS_AGREE
+def _frames(evidence: _Evidence) -> Finding:
+    """Photos whose own matches contradict their poses."""
+    photos = tuple(evidence.names[i] for i in evidence.wrong)
+    text = f"the poses of {first_names(photos, 5)} contradict their matches with other photos"
+    if evidence.minority:
+        return Finding("poses", f"{text}; a training leaves them out", photos=photos)
+    return Finding("poses", f"{text}; estimate the poses again")
 
 
-def _by_matches(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Finding]:
-    """Without coloured points: only matches."""
-    if fit.share >= _MATCHES_AGREE:
-        return _focal(rig, matches, fit)
-    if repairs := _explaining(rig, matches, fit):
-        return [_mistake(repairs[0], _of_matches(fit))]
-    proven = len(matches.pairs) >= _PAIRS_FOR_PROOF and fit.share < _MATCHES_CONTRADICT
-    return [_disorder(_of_matches(fit), impossible=proven)]
-
-
-def _by_colours(rig: Rig, colours: ColourEvidence, agreement: Agreement) -> list[Finding]:
-    """Photos without matches: only the colours of the points."""
-    candidates = [*pose_repairs(rig), *point_repairs(rig)]
-    if repair := _best_by_colours(candidates, colours, agreement):
-        return [_mistake(repair, _of_colours(agreement))]
-    return [_disorder(_of_colours(agreement), impossible=False)]
-
-
-def _points(rig: Rig, colours: ColourEvidence, agreement: Agreement) -> list[Finding]:
-    """The poses fit the photos, but the points do not fit both."""
-    if agreement.agreeing >= _COLOURS_AGREE:  # the points cover only a part of the views
-        return []
-    if repair := _best_by_colours(point_repairs(rig), colours, agreement):
-        return [_mistake(repair, _of_colours(agreement))]
-    if agreement.correlation >= _COLOURS_FIT:
-        return []
-    text = f"{_of_colours(agreement)}; the points may be in another frame than the poses"
-    return [Finding("points", text)]
-
-
-def _by_both(
-    rig: Rig, colours: ColourEvidence, agreement: Agreement, matches: MatchEvidence, fit: Fit
-) -> list[Finding]:
-    """Neither the colours nor the matches fit the poses."""
-    evidence = f"{_of_matches(fit)}, and {_of_colours(agreement)}"
-    if repairs := _explaining(rig, matches, fit):
-        return [_mistake(_best_by_colours(repairs, colours, agreement) or repairs[0], evidence)]
-    proven = len(matches.pairs) >= _PAIRS_FOR_PROOF and agreement.agreeing < _COLOURS_CONTRADICT
-    return [_disorder(evidence, impossible=proven)]
-
-
-def _focal(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Finding]:
-    """Matches may lie near their epipolar lines with any focal length, if all cameras look at one
-    small object. But they are nearest with the right one."""
-    best, best_fit = None, fit
-    for repair in zooms(rig):
-        if (tried := matches.fit(repair.rig)).median < best_fit.median:
-            best, best_fit = repair, tried
-    with np.errstate(invalid="ignore"):  # infinite: behind a camera
-        ratios = fit.medians / best_fit.medians
-    clear = np.median(ratios) >= _SHARPER and np.mean(ratios > 1) >= _MATCHES_PROVE
-    if best is None or not clear or best_fit.share < _MATCHES_PROVE:
-        return []
-    return [Finding("focal length", f"{best.mistake}, as the matches between the photos say")]
-
-
-def _explaining(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Repair]:
-    """The repairs that make the matches agree, the best one first."""
-    found = []
-    for repair in pose_repairs(rig):
-        tried = matches.fit(repair.rig)
-        if tried.share >= max(_MATCHES_PROVE, fit.share + 2 * _BETTER):
-            found.append((tried.median, repair))
-    best = min((median for median, _ in found), default=0.0)
-    # Several names for one mistake fit equally, up to rounding: the usual one stands first.
-    found = [(0.0 if median < 1.05 * best else median, repair) for median, repair in found]
-    return [repair for _, repair in sorted(found, key=lambda pair: pair[0])]
-
-
-def _best_by_colours(
-    repairs: Iterable[Repair], colours: ColourEvidence, agreement: Agreement
-) -> Repair | None:
-    """The repair with which the colours agree best; None if they do with none of them."""
-    best, best_value = None, max(agreement.correlation, 0.0) + _BETTER
-    for repair in repairs:
-        value = colours.correlation(repair.rig, repair.points, _POINTS_TO_TRY)
-        if value > best_value:
-            best, best_value = repair, value
-    if best is None:
-        return None
-    confirmed = _agrees(colours.agreement(best.rig, best.points), len(best.rig))
-    return best if confirmed else None
-
-
-def _of_matches(fit: Fit) -> str:
-    return f"only {np.mean(fit.shares):.0%} of the matches between photos agree with the poses"
+def _tracks(count: int, off: Sequence[float], *, far: bool) -> Finding:
+    """Photos in which the points are not where they were observed."""
+    distance = float(np.median(off))
+    place = (
+        "behind the camera"
+        if np.isinf(distance)
+        else f"{distance:.1%} of the size of the photo away from where it was observed"
+    )
+    text = (
+        f"poses and points do not fit each other: in {len(off)} of {count} photos, a "
+        f"typical point is {place}; they were changed, or lost digits, after the "
+        "reconstruction; export both again, in one frame near the origin"
+    )
+    return Finding("poses", text, impossible=far)
 
 
 def _of_colours(agreement: Agreement) -> str:
@@ -346,10 +283,8 @@ def _of_colours(agreement: Agreement) -> str:
     )
 
 
-def _mistake(repair: Repair, evidence: str) -> Finding:
-    return Finding(
-        repair.about, f"{evidence}; {repair.mistake}; correct the dataset", impossible=True
-    )
+def _mistake(repair: Repair, evidence: str, *, impossible: bool) -> Finding:
+    return Finding(repair.about, f"{evidence}; {repair.mistake}; correct the dataset", impossible)
 
 
 def _disorder(evidence: str, *, impossible: bool) -> Finding:
