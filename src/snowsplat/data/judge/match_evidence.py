@@ -27,9 +27,9 @@ from snowsplat.data.photos.decode import load_thumbnail
 from snowsplat.scene.epipolar import LEAST_FALSE, distances_of_matches, likelihood, log_odds
 from snowsplat.util.errors import UserError
 
-SIDE = 320  # pixels of the longer side of the copies of photos
+_SIDE = 320  # pixels of the longer side of the copies of photos
 _MOST_VIEWS = 256  # that are looked at, spread over larger datasets
-SPREAD = 24  # views of which all pairs are matched
+_SPREAD = 24  # views of which all pairs are matched
 _AROUND = 3  # views before and after each in the order of names, and nearest ones by pose
 _FEATURES = 500  # of each photo
 _RATIO = 0.8  # of the distances to the best and the second best feature, as in Lowe's paper
@@ -48,7 +48,8 @@ _MOST_NATS = math.log((1 - _FALSE) / _BY_CHANCE)
 _WRONG, _CERTAIN = 0.01, 10.0
 _PIXELS = 1600.0  # of the longer side, for `likelihood`
 
-_In, _Out = TypeVar("_In"), TypeVar("_Out")
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class PhotoSample:
         if len(views) > _MOST_VIEWS:
             first = np.linspace(0, len(views) - 2, _MOST_VIEWS // 2).round().astype(int)
             chosen = np.unique([first, first + 1])
-        decoded = _in_threads(_photo, [views[i] for i in chosen])
+        decoded = _in_threads(_photo, [views[i] for i in chosen.tolist()])
         kept = [(int(i), p) for i, p in zip(chosen, decoded, strict=True) if p is not None]
         return cls([i for i, _ in kept], [photo for _, photo in kept])
 
@@ -81,7 +82,7 @@ class PhotoSample:
 
     def spread(self) -> list[int]:
         """Some of the views, by their index in the sample."""
-        every = np.linspace(0, len(self) - 1, min(len(self), SPREAD)).round().astype(int)
+        every = np.linspace(0, len(self) - 1, min(len(self), _SPREAD)).round().astype(int)
         return [int(i) for i in np.unique(every)]
 
 
@@ -168,7 +169,7 @@ class MatchEvidence:
         self._tried: set[tuple[int, int]] = set()
         self.pairs: list[Pair] = []
         count = len(sample)
-        if count <= SPREAD:
+        if count <= _SPREAD:
             self._add(combinations(range(count), 2))
         else:
             self._add((i, i + step) for step in range(1, _AROUND + 1) for i in range(count - step))
@@ -229,7 +230,7 @@ def _in_threads(function: Callable[[_In], _Out], items: Sequence[_In]) -> list[_
 
 def _photo(view: View) -> np.ndarray | None:
     try:
-        return load_thumbnail(view.image, SIDE)
+        return load_thumbnail(view.image, _SIDE)
     except UserError:  # the training says so, or leaves the photo out
         return None
 
