@@ -176,6 +176,17 @@ def test_an_absurd_focal_length_becomes_that_of_exif():
     assert np.exp(found[:2]) == pytest.approx([FOCAL, FOCAL], rel=0.01)
 
 
+def test_the_coefficients_of_a_fisheye_lens_remain_small():
+    """θ is at most 0.7 in these photos, which do not determine k₃ and k₄."""
+    model = photographed(list(round_walk()), box_of_points())
+    model.cameras[1].model = pycolmap.CameraModelId.OPENCV_FISHEYE
+    model.cameras[1].params = [FOCAL, FOCAL, *CENTRE, 1 / 3, 0, 0, 0]
+    model.update_point_3d_errors()
+    found = estimate_lenses(model, {}, False, 1)
+    assert np.abs(found.cameras[1].params[6:]).max() < 0.5
+    assert found.compute_mean_reprojection_error() < 0.5
+
+
 def test_a_distortion_that_no_lens_has_needs_evidence():
     """Photos of a plane from nearly one direction hardly determine the distortion."""
     things = np.random.default_rng(0).uniform((-1.5, -1.2, 0), (1.5, 1.2, 0.05), (300, 3))

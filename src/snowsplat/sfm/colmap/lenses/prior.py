@@ -41,9 +41,12 @@ _SQUARE = 0.0005, 0.3
 # Of the principal point from the centre of the photo, in each direction, divided by the longer
 # side: the lens on a sensor is off by about this.
 _CENTRE = 0.01, 0.2
-# Of k₁ ρ², k₂ ρ⁴, p₁ ρ and p₂ ρ.
-_DISTORTION = ((0.1, 0.3), (0.03, 0.3), (0.0005, 0.01), (0.0005, 0.01))
-_POWERS = 2, 4, 1, 1
+# Of k₁ ρ², k₂ ρ⁴, p₁ ρ and p₂ ρ; of k₁ ρ² to k₄ ρ⁸ of a fisheye lens, where ρ is about the angle.
+_ORDINARY = (2, (0.1, 0.3)), (4, (0.03, 0.3)), (1, (0.0005, 0.01)), (1, (0.0005, 0.01))
+_FISHEYE = tuple((power, (0.1, 0.5)) for power in (2, 4, 6, 8))
+_DISTORTIONS = dict.fromkeys(POLYNOMIAL, _ORDINARY) | dict.fromkeys(
+    ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"), _FISHEYE
+)
 
 
 @dataclass(frozen=True)
@@ -107,11 +110,10 @@ def terms(camera: pycolmap.Camera, exif: float | None, certain: bool = False) ->
         yield term({focals[0]: 1.0, focals[1]: -1.0}, 0.0, _SQUARE)
     for i, half in zip(camera.principal_point_idxs(), size / 2, strict=True):
         yield term({i: 1 / size.max()}, half / size.max(), _CENTRE)
-    if camera.model_name in POLYNOMIAL:
-        corner = float(np.hypot(*size)) / (2 * camera.mean_focal_length())
-        coefficients = zip(camera.extra_params_idxs(), _POWERS, _DISTORTION, strict=False)
-        for i, power, sigmas in coefficients:
-            yield term({i: corner**power}, 0.0, sigmas)
+    known = _DISTORTIONS.get(camera.model_name, ())
+    corner = float(np.hypot(*size)) / (2 * camera.mean_focal_length())
+    for i, (power, sigmas) in zip(camera.extra_params_idxs(), known, strict=False):
+        yield term({i: corner**power}, 0.0, sigmas)
 
 
 def log_prior(camera: pycolmap.Camera, exif: float | None) -> float:
