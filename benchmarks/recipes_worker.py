@@ -20,8 +20,8 @@ from torch import Tensor
 from snowsplat import Dataset, Trainer, UserError, load_dataset, ops, recipe
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.scene.render import project, render
+from snowsplat.training.core.view_queue import FIXED_BACKGROUNDS
 from snowsplat.training.settings.stored import config_to_json
-from snowsplat.training.step.background import FIXED_BACKGROUNDS
 
 #: Share of the views that `sector` holds out.
 SECTOR = 1 / 8

@@ -22,13 +22,13 @@ from snowsplat.scene.render import render
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.core.view_queue import Background
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.parts.densification import Densification
 from snowsplat.training.settings import TrainConfig, changed
 from snowsplat.training.settings.rates import DecayRates, LearningRates
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.starts import STARTS
-from snowsplat.training.step.background import Background
 from snowsplat.training.step.losses import view_loss
 from snowsplat.util.errors import UserError
 

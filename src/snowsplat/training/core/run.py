@@ -16,17 +16,15 @@ from snowsplat.data.photos.image_loader import ImageLoader, Photos, available_me
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import seen_from
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.regularizers import regularizing
 from snowsplat.training.core.run_state import RESERVED, load_state, state_tensors
 from snowsplat.training.core.view_graphs import GraphRecorder, ViewGraphs, recordable
-from snowsplat.training.core.view_queue import ViewQueue
+from snowsplat.training.core.view_queue import Background, ViewQueue
 from snowsplat.training.parts.list import parts_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import ALONE, Shards, sharded_render
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.starts.init import initial_gaussians
-from snowsplat.training.step.background import Background
 from snowsplat.training.step.losses import view_loss
 from snowsplat.training.step.optim import Adam
 from snowsplat.training.step.step_runner import StepRunner
@@ -328,3 +326,29 @@ def _with_valid_names(parts: Sequence[Part]) -> list[Part]:
     if bad := [name for name in names if name in RESERVED or "." in name or not name]:
         raise UserError("a part cannot have the name {bad!r}; set another `name`", bad=bad[0])
     return list(parts)
+
+
+def regularizing(parts: Sequence[Part]) -> list[Part]:
+    """The parts that override `Part.regularizer`."""
+    return [part for part in parts if type(part).regularizer is not Part.regularizer]
+
+
+def add_regularizers(run: Run) -> None:
+    """Add the gradients of `Part.regularizer` of all parts to ``.grad`` of the parameters.
+
+    The optimiser adds ``.grad`` to the gradient of the photos, and clears it.
+    """
+    used = regularizing(run.parts)
+    if not used:
+        return
+    leaves = run.gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+    with torch.enable_grad():
+        terms = [part.regularizer(run, leaves) for part in used]
+        for term in terms:
+            if term is not None and term.requires_grad:
+                term.backward()
+    leaf_of = leaves.parameters()
+    for name, parameter in run.gaussians.parameters().items():
+        gradient = leaf_of[name].grad
+        if gradient is not None:
+            parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient

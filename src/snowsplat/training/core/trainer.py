@@ -12,8 +12,7 @@ from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.scene.render import RenderOutput
 from snowsplat.training.core.progress import Progress
-from snowsplat.training.core.regularizers import add_regularizers
-from snowsplat.training.core.run import Run
+from snowsplat.training.core.run import Run, add_regularizers
 from snowsplat.training.core.view_graphs import Objective
 from snowsplat.training.step.batch import Batch, BatchView, batch_gradients
 from snowsplat.training.step.view_gradient import ViewGradient

@@ -14,9 +14,9 @@ from snowsplat.data.dataset import Dataset, Points
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.training.settings.starts import STARTS
 from snowsplat.training.starts.depth import depth_points
-from snowsplat.training.starts.map_views import map_pixels
 from snowsplat.training.starts.plane_sweep import swept_points
 from snowsplat.training.starts.random_rays import random_points
+from snowsplat.training.starts.source_views import map_pixels
 
 if TYPE_CHECKING:
     from snowsplat.training.settings.starts import Start

@@ -24,8 +24,8 @@ from snowsplat.training.starts.depth_map import (
     photo_for_map,
 )
 from snowsplat.training.starts.fusion import fused_points
-from snowsplat.training.starts.map_views import choose_views
 from snowsplat.training.starts.photos import usable_pixels
+from snowsplat.training.starts.source_views import choose_views
 from snowsplat.util.errors import SettingError, UserError
 
 logger = logging.getLogger(__name__)

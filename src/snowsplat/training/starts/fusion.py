@@ -12,8 +12,8 @@ from torch import Tensor
 from snowsplat.data.dataset import Points
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.training.starts.depth_map import DepthMap
-from snowsplat.training.starts.map_views import MapViews
 from snowsplat.training.starts.photos import in_threads, reduced_photo
+from snowsplat.training.starts.source_views import MapViews
 
 #: Two inverse depths of one point agree if they differ by at most this share.
 _TOLERANCE = 0.02

@@ -20,8 +20,8 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import compose_rigid
 from snowsplat.training.starts.depth_map import LONGER_SIDE, DepthMap, photo_for_map
 from snowsplat.training.starts.fusion import fused_points
-from snowsplat.training.starts.map_views import choose_views
 from snowsplat.training.starts.photos import in_threads, usable_pixels
+from snowsplat.training.starts.source_views import choose_views
 
 #: Windows have (2 r + 1)² pixels.
 _RADIUS = 3
