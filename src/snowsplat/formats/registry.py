@@ -71,6 +71,9 @@ class Format:
         return self.bytes(path) if self.bytes else path.stat().st_size
 
 
+_UNMARKED = "the antialiased mark"
+_ROUNDED = f"nothing except for rounding and {_UNMARKED}"
+
 #: ``recognises`` is called in this order: special formats are before general ones.
 FORMATS: list[Format] = [
     Format(
@@ -94,14 +97,14 @@ FORMATS: list[Format] = [
         True,
         spz_version,
     ),
-    Format("gsplat checkpoint", (".pt",), is_checkpoint, read_checkpoint, None, "nothing"),
+    Format("gsplat checkpoint", (".pt",), is_checkpoint, read_checkpoint, None, _UNMARKED),
     Format(
         "USD",
         (".usd", ".usdc", ".usda", ".usdz"),
         is_usd,
         read_usd,
         write_usd,
-        "nothing except for rounding",
+        _ROUNDED,
         stores_origin=True,
     ),
     Format(
@@ -142,7 +145,7 @@ FORMATS: list[Format] = [
         is_glb,
         read_gltf,
         write_glb,
-        "nothing except for rounding",
+        _ROUNDED,
         version=lambda _: "2, KHR_gaussian_splatting",
         stores_origin=True,
     ),
@@ -152,7 +155,7 @@ FORMATS: list[Format] = [
         is_gltf,
         read_gltf,
         None,
-        "nothing except for rounding",
+        _ROUNDED,
         version=lambda _: "2, KHR_gaussian_splatting",
         stores_origin=True,
     ),
@@ -162,7 +165,8 @@ FORMATS: list[Format] = [
         None,
         read_splat,
         write_splat,
-        "all SH, colours beyond black and white; rotations, colours and opacity have 8 bits",
+        "all SH, the antialiased mark, colours beyond black and white; rotations, colours and "
+        "opacity have 8 bits",
     ),
     Format(
         "ksplat",
@@ -170,7 +174,7 @@ FORMATS: list[Format] = [
         None,
         read_ksplat,
         None,
-        "precision: SH have 8 to 32 bits, all other values 16 or 32",
+        f"precision: SH have 8 to 32 bits, all other values 16 or 32; {_UNMARKED}",
     ),
     Format(
         "RAD",
