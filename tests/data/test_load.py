@@ -3,6 +3,7 @@
 import dataclasses
 import logging
 import shutil
+import zipfile
 
 import numpy as np
 import pytest
@@ -320,3 +321,11 @@ def test_points_move_together():
     assert moved.xyz.device.type == moved.rgb.device.type == "meta"
     assert moved.rgb.dtype == torch.uint8
     assert len(points.to(torch.device("cpu"))) == 2
+
+
+def test_a_zip_file_is_no_dataset(tmp_path):
+    """It begins like the cameras.npz of IDR."""
+    with zipfile.ZipFile(tmp_path / "photos.zip", "w") as packed:
+        packed.writestr("photos/0.jpg", b"a photo")
+    with pytest.raises(UserError, match=r"photos.zip: is a zip file; unpack it"):
+        load_dataset(tmp_path / "photos.zip")

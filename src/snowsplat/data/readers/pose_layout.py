@@ -73,7 +73,7 @@ class Layout:
 
     def has_poses(self, path: Path) -> bool:
         """Whether a file or folder has poses in this layout."""
-        if path.is_dir() != bool(self.files):
+        if path.is_dir() != bool(self.files) or not path.match(self.place):
             return False
         found = islice(path.glob(self.files), TRIED) if self.files else [path]
         return any(re.match(self.start, parse.head_of(file)) for file in found)
