@@ -97,9 +97,12 @@ def test_photos_that_say_nothing_leave_the_model_as_it_is():
     assert estimate_lenses(model, {}, False, 1) is model
 
 
-def test_a_camera_without_principal_point_is_left_alone():
-    model = pycolmap.Reconstruction()
-    assert estimate_lenses(model, {}, False, 1) is model
+@pytest.mark.parametrize(("least", "same"), [(12, False), (13, True)])
+def test_models_with_few_photos_of_a_camera_are_left_alone(monkeypatch, least, same):
+    monkeypatch.setattr(posterior, "_PHOTOS_OF_CAMERA", least)
+    model = photographed(list(round_walk()), box_of_points())
+    assert (estimate_lenses(model, {}, False, 1) is model) == same
+    assert estimate_lenses(pycolmap.Reconstruction(), {}, False, 1).num_reg_images() == 0
 
 
 @pytest.mark.parametrize("seed", range(3))
