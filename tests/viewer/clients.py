@@ -283,6 +283,60 @@ def _wrong_types(url: str, seconds: float) -> None:
             time.sleep(0.001)
 
 
+def _random_value(depth: int = 0) -> object:
+    """A value of JSON. None of them pauses a training."""
+    kind = random.randrange(8 if depth < 3 else 5)
+    if kind == 0:
+        return random.choice(WRONG)
+    if kind == 1:
+        return random.uniform(-1, 1) * 10.0 ** random.randrange(-320, 308)
+    if kind == 2:
+        return random.randrange(-(2**70), 2**70)
+    if kind == 3:
+        return random.choice(["", "view", "color", "x" * random.randrange(3000), "\0\ud800"])
+    if kind == 4:
+        return random.choice([True, False, None])
+    if kind in (5, 6):
+        return [_random_value(depth + 1) for _ in range(random.randrange(6))]
+    return {str(_random_value(3))[:9]: _random_value(depth + 1) for _ in range(random.randrange(4))}
+
+
+def _random_message() -> str | bytes:
+    """Random bytes, cut and joined messages of the page, and such with random fields."""
+    kind = random.randrange(8)
+    if kind == 0:
+        return random.randbytes(random.randrange(200))
+    if kind == 1:
+        return random.choice(wrong_messages())
+    if kind == 2:
+        both = view() + display()
+        return both[random.randrange(len(both)) :][: random.randrange(300)]
+    if kind == 3:
+        return json.dumps(_random_value())
+    known = json.loads(random.choice([view(), display(), '{"type": "shown", "number": 1}']))
+    if kind == 4:
+        known = {"type": random.choice(["training", "share", "key", "x"]), "do": "resume"}
+    for _ in range(random.randrange(3)):
+        known[random.choice([*known, "do", "share", "number", "more"])] = _random_value()
+    return json.dumps(known)
+
+
+def _random_messages(url: str, seconds: float) -> None:
+    """Many more than a page can send; a connection that is closed is made again."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        with contextlib.suppress(OSError):
+            client = upgrade(url)
+            for _ in range(random.randrange(1, 2000)):
+                content = _random_message()
+                opcode = 1 if isinstance(content, str) else 2
+                if random.random() < 0.002:  # most of these close the connection
+                    opcode = random.randrange(16)
+                whole = frame(content, opcode, fin=random.random() > 0.001)
+                client.sendall(whole if random.random() > 0.001 else whole[: len(whole) // 2])
+            reset(client)
+
+
 def _huge_frame(url: str, seconds: float) -> None:
     with upgrade(url) as client:
         client.sendall(frame(b"", length=1 << 62))
@@ -375,6 +429,7 @@ def _comers(url: str, seconds: float) -> None:
 HOSTILE: dict[str, Callable[[str, float], None]] = {
     "garbage": _garbage,
     "wrong types": _wrong_types,
+    "random messages": _random_messages,
     "huge frame": _huge_frame,
     "pings": _pings,
     "millions of messages": _millions,

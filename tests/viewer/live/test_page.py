@@ -131,10 +131,12 @@ def test_answers_that_are_not_received_are_few(viewer):
         visitor.view()
         for _ in range(300):
             visitor.send("key")
+        visitor.wait_for("key")
         visitor.pictures(1.0)
-        assert 1 <= len(visitor.keys) <= 300
+        assert len(visitor.keys) <= 300
         (browser,) = viewer._browsers
-        assert len(browser._keys) == 0
+        while browser._keys:
+            visitor.pictures(0.1)
         viewer.server.call(lambda: [browser.tell_key({}) for _ in range(300)])
         visitor.keys.clear()
         visitor.pictures(0.5)
