@@ -123,13 +123,6 @@ def test_the_combination_has_the_largest_product_of_both_densities(seed):
         assert cost(best + step) > cost(best)
 
 
-@pytest.mark.parametrize(("error", "expected"), [(1e-6, 3.0), (1e6, 0.0)])
-def test_a_certain_estimate_and_none_at_all(error, expected):
-    known = [Term(np.eye(2)[i], 0.0, 1.0, 1.0) for i in range(2)]
-    found = combine_with_prior(np.full(2, 3.0), error**2 * np.eye(2), known)
-    assert np.allclose(found, expected, atol=1e-6)
-
-
 @pytest.mark.parametrize(("error", "expected"), [(0.1, 30.0), (20.0, 0.0)])
 def test_what_the_photos_clearly_contradict_has_no_effect(error, expected):
     """A value of 30, where 1 is usual and 100 is not impossible."""
