@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops import cuda
+from snowsplat.ops.cuda import launches
 
 from .scenes import (
     REFERENCE,
@@ -221,8 +221,8 @@ def test_channels_one_after_the_other(native: Variant, monkeypatch: pytest.Monke
     """For large images a GPU processes few channels at a time, with bit-identical results."""
     a, b = (i.to(native.dtype) for i in images(11, 27, 35))
     results = []
-    for limit in (cuda.photometric._MAPS_BYTES, 6 * 27 * 35 * a.element_size(), 0):
-        monkeypatch.setattr(cuda.photometric, "_MAPS_BYTES", limit)
+    for limit in (launches._MAPS_BYTES, 6 * 27 * 35 * a.element_size(), 0):
+        monkeypatch.setattr(launches, "_MAPS_BYTES", limit)
         image = a.clone().requires_grad_()
         value = native.ops.photometric_loss(image, b)
         value.backward()
