@@ -31,6 +31,9 @@ _PLANES = (32, 128)
 #: The fine sweep has this number of planes around the depth of the coarse sweep, ± this number of
 #: coarse planes.
 _FINE_PLANES, _FINE_RANGE = 8, 1.0
+#: If the planes begin at infinity, depths within this number of them are no depths: displacements
+#: so small do not tell them, and a few Gaussians far behind the scene change its mean depths.
+_FROM_INFINITY = 2.0
 #: A depth is kept if its mean correlation is at least this.
 _LEAST_SCORE = 0.5
 #: The range of inverse depths is that of the visible points without this share on each side,
@@ -150,7 +153,8 @@ def _swept(picture: Picture, sources: list[Picture], span: tuple[float, float]) 
     rough = interpolate(rough[None, None], fine.image.shape, mode="nearest")[0, 0]
     around = _FINE_RANGE * (high - low) / (planes - 1)
     inverse, score = fine.sweep(-around, around, _FINE_PLANES, rough)
-    known = (score >= _LEAST_SCORE) & (inverse > 0.0) & (rough > 0.0)
+    least = 0.0 if low > 0.0 else _FROM_INFINITY * around
+    known = (score >= _LEAST_SCORE) & (inverse > least) & (rough > 0.0)
     if picture.usable is not None:
         known &= picture.usable
     return DepthMap(picture.camera, torch.where(known, inverse, 0.0))
