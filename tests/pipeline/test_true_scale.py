@@ -25,7 +25,7 @@ from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.edit import merge, transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
-from snowsplat.scene.origin import metres_of, stored_metres
+from snowsplat.scene.length import metres_of, stored_metres
 from snowsplat.util.errors import SettingError
 from snowsplat.util.files import write_json
 from snowsplat.util.messages import message

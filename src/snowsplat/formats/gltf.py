@@ -30,7 +30,8 @@ from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.glb import Document
 from snowsplat.formats.spz import parse_spz
-from snowsplat.scene.origin import Origin, stored_metres
+from snowsplat.scene.length import stored_metres
+from snowsplat.scene.origin import Origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_bytes

@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from snowsplat.scene.origin import HERE, Origin, stored_metres, stored_origin
+from snowsplat.scene.length import stored_metres
+from snowsplat.scene.origin import HERE, Origin, stored_origin
 from snowsplat.util.files import COMPLETE, write_json
 from snowsplat.util.safe_json import is_file, parse_json
 

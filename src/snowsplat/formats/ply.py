@@ -27,7 +27,8 @@ import numpy as np
 from snowsplat.formats.damage import Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, float32_gaussians, unusable
 from snowsplat.formats.packing import FLAT
-from snowsplat.scene.origin import HERE, Origin, add_origins, stored_metres, stored_origin
+from snowsplat.scene.length import stored_metres
+from snowsplat.scene.origin import HERE, Origin, add_origins, stored_origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.files import atomic_path
 from snowsplat.util.names import first_names

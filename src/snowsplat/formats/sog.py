@@ -40,7 +40,8 @@ from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
 from snowsplat.formats.damage import Damaged, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, float32_gaussians, without_unusable
 from snowsplat.formats.sog_container import Bundle
-from snowsplat.scene.origin import HERE, add_origins, stored_metres, stored_origin
+from snowsplat.scene.length import stored_metres
+from snowsplat.scene.origin import HERE, add_origins, stored_origin
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_bytes

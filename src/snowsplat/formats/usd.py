@@ -30,7 +30,7 @@ from snowsplat.formats.archive import first_member
 from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.gltf import place_in_scene
-from snowsplat.scene.origin import stored_metres
+from snowsplat.scene.length import stored_metres
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import new_entries

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
 
     from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.pipeline.run.results import TrainResult
+    from snowsplat.project.training_folder import TrainingFolder
     from snowsplat.sfm.report.scene_map import PlacedPhoto
     from snowsplat.training.core.progress import Progress
     from snowsplat.util.stages import Outcome

@@ -11,7 +11,7 @@ import numpy as np
 from snowsplat.pipeline.output.scene_source import cameras_of, change_of
 from snowsplat.project.project import Project
 from snowsplat.scene.geometry import Similarity
-from snowsplat.scene.origin import metres_of
+from snowsplat.scene.length import metres_of
 from snowsplat.util.errors import SettingError
 from snowsplat.util.messages import Message, as_message, message
 from snowsplat.util.safe_json import quoted

@@ -1,4 +1,4 @@
-"""The origin of a scene that is far away from 0, to which positions are relative; its true scale.
+"""The origin of a scene that is far away from 0: positions are stored relative to it.
 
 float32 has 24 bits: at 5,400,000 m, the northing of a UTM coordinate, two neighbouring numbers are
 half a metre apart. Positions that are read with more digits are therefore moved, in float64, by a
@@ -7,21 +7,13 @@ round number near their median. The scene keeps that number as its origin, three
     position in the world = position in memory + origin
 
 The origin is (0, 0, 0) unless the distance makes the move necessary.
-
-The true scale of a scene is the number of metres in one of its world units, `metres_per_unit` of
-the Gaussians and of a dataset. None: it is unknown, as for photos without any measure. Files say
-it: a comment of PLY, an entry of SOG, the node of glTF, whose unit is the metre; a file beside
-other ones.
 """
 
 from __future__ import annotations
 
 import math
-import re
 
 import numpy as np
-
-from snowsplat.util.errors import Problem
 
 Origin = tuple[float, float, float]
 
@@ -34,11 +26,6 @@ _OF_SIZE = 0.01  # the same, relative to the usual size of a Gaussian
 _HALF_STEP = 2.0**-24  # largest relative rounding error of float32
 _FARTHEST = 1e15  # limit of coordinates; computations in float32 are finite
 _SAMPLE = 1 << 16  # points from which median and extent are estimated
-#: What is written after a number, in metres.
-UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
-_LENGTH = re.compile(r"([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*([a-z]+)", re.IGNORECASE)
-# A unit between these lengths, in metres: what is smaller or larger is damaged, not measured.
-_LEAST, _MOST = 1e-12, 1e12
 
 
 def origin_of(points: np.ndarray, size: float = 0.0) -> Origin:
@@ -85,28 +72,3 @@ def opposite(origin: Origin) -> Origin:
 def add_origins(a: Origin, b: Origin) -> Origin:
     """The origin of positions relative to ``a`` that are relative to ``b`` themselves."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
-
-
-def metres_of(text: str) -> float:
-    """The length that ``text`` states, such as "0.45m", "45 cm" or "17.5in", in metres.
-
-    Raises: ValueError: there is no positive number, or no unit after it.
-    """
-    found = _LENGTH.fullmatch(text.strip())
-    unit = UNITS.get(found[2].lower()) if found else None
-    metres = float(found[1]) * unit if found and unit else 0.0
-    if not _LEAST < metres < _MOST:
-        known = ", ".join(UNITS)
-        raise Problem(
-            "{text!r} is not a length; use a number with its unit ({known}): 0.45m",
-            text=text,
-            known=known,
-        )
-    return metres
-
-
-def stored_metres(value: object) -> float | None:
-    """The metres per unit that a value from a file stands for; None if it is no positive number."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    return float(value) if _LEAST < value < _MOST else None

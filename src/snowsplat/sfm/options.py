@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from snowsplat.scene.origin import metres_of
+from snowsplat.scene.length import metres_of
 from snowsplat.util.settings import Settings, group, setting, switch
 
 Mapper = Literal["incremental", "global"]

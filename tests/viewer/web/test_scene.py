@@ -26,7 +26,7 @@ from snowsplat.viewer.http.server import WebServer
 from snowsplat.viewer.http.static import static_app
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import ready, site
-from snowsplat.viewer.web.viewer_page import FILM_SECONDS
+from snowsplat.viewer.web.viewer_settings import FILM_SECONDS
 
 from ...browser import Browser, Page
 

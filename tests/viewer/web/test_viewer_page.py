@@ -18,9 +18,9 @@ from snowsplat.viewer.web.viewer_page import (
     page_anew,
     panel_script,
     panel_style,
-    settings,
     whole_page,
 )
+from snowsplat.viewer.web.viewer_settings import settings
 
 HOSTILE = "</script><script>alert(1)</script><!-- <script>"
 

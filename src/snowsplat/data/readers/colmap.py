@@ -28,7 +28,7 @@ from snowsplat.data.frame.placement import read_placement
 from snowsplat.data.readers import transforms_json
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reader, Reconstruction
-from snowsplat.scene.origin import stored_metres
+from snowsplat.scene.length import stored_metres
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import inside, is_file, quoted

@@ -24,7 +24,7 @@ from snowsplat.scene.initial_view import InitialView
 from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.scene import ReadyScene, ready, viewing_frame
-from snowsplat.viewer.web.viewer_page import Annotation
+from snowsplat.viewer.web.viewer_settings import Annotation
 
 
 @dataclass(frozen=True)

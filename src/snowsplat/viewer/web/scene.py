@@ -27,14 +27,8 @@ from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.static import Served, ServedFile, served
 from snowsplat.viewer.web.panel import Description, Hiding, hiding_of, panel_settings
 from snowsplat.viewer.web.stops import Stops, stops_of
-from snowsplat.viewer.web.viewer_page import (
-    Annotation,
-    asset,
-    content_policy,
-    page,
-    script,
-    settings,
-)
+from snowsplat.viewer.web.viewer_page import asset, content_policy, page, script
+from snowsplat.viewer.web.viewer_settings import Annotation, settings
 
 _SCENE = "scene.compressed.ply"
 #: The file with the pictures of the stops.

@@ -1,6 +1,6 @@
 """The page for finished scenes: the SuperSplat viewer of PlayCanvas, bundled with the package.
 
-The page is third-party (third_party/README.md names the version). Settings,
+The page is third-party (third_party/README.md names the version). Settings (viewer_settings.py),
 the title and the initial view are inserted at the places that it provides, and the panel (panel.py)
 at the place where the page creates the viewer. The studio serves it, so this needs no torch.
 """
@@ -12,15 +12,13 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import parse_json
 from snowsplat.util.theme import with_colours
-from snowsplat.viewer.web.panel import view_numbers
 
 _FOLDER = Path(__file__).parents[2] / "_viewer"  # of the package
 _PANEL = Path(__file__).parent
@@ -40,8 +38,6 @@ _BOOTSTRAP = '(<script type="application/json" id="sse-bootstrap">){}(</script>)
 _SLOT = re.compile(_BOOTSTRAP.format(r"\s*null\s*"))
 _GIVEN = re.compile(_BOOTSTRAP.format("(.*?)"), re.DOTALL)
 _INLINE_SCRIPT = re.compile(r'<script(?: type="module")?>(.*?)</script>', re.DOTALL)
-#: Duration of the animation of the page.
-FILM_SECONDS = 20.0
 
 
 def asset_file(name: str) -> Path:
@@ -189,72 +185,3 @@ def _replaced(text: str, old: str, new: str) -> str:
 def _json_in_script(value: Any) -> str:
     # "<" could end the script element or begin a comment in it.
     return json.dumps(value).replace("<", "\\u003c")
-
-
-class Annotation(NamedTuple):
-    """A text at a place: the target of the view that shows it."""
-
-    title: str
-    text: str
-    view: InitialView
-
-
-def settings(
-    start: InitialView,
-    background: Sequence[float],
-    film: Sequence[InitialView] = (),
-    notes: Sequence[Annotation] = (),
-) -> dict[str, Any]:
-    """The viewer's settings: its initial view, and a background colour in 0..1.
-
-    ``film``: views at equal distances in time, `FILM_SECONDS` in total: the animation of the page.
-    If there are none, the viewer uses an animation of its own.
-    """
-    off = {"enabled": False}
-    first = view_numbers(start, start.aspect)
-    return {
-        "version": 2,
-        "tonemapping": "none",  # colours are displayed as they were trained
-        "highPrecisionRendering": False,
-        "background": {"color": list(background)},
-        "postEffectSettings": {
-            "sharpness": {**off, "amount": 0},
-            "bloom": {**off, "intensity": 0.1, "blurLevel": 2},
-            "grading": {**off, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
-            "vignette": {**off, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
-            "fringing": {**off, "intensity": 0.5},
-        },
-        "animTracks": [_track(film, start.aspect)] if film else [],
-        "cameras": [{"initial": {"position": first[:3], "target": first[3:6], "fov": first[6]}}],
-        "annotations": [_annotation(note, start.aspect) for note in notes],
-        "startMode": "animTrack" if film else "default",
-    }
-
-
-def _annotation(note: Annotation, aspect: float) -> dict[str, Any]:
-    numbers = view_numbers(note.view, aspect)
-    position, target, fov = numbers[:3], numbers[3:6], numbers[6]
-    initial = {"position": position, "target": target, "fov": fov}
-    texts = {"title": note.title, "text": note.text}
-    return {"position": target, **texts, "extras": {}, "camera": {"initial": initial}}
-
-
-def _track(film: Sequence[InitialView], aspect: float) -> dict[str, Any]:
-    times = [i * FILM_SECONDS / (len(film) - 1) for i in range(len(film))]
-    keys = [view_numbers(view, aspect) for view in film]
-    return {
-        "name": "film",
-        "duration": FILM_SECONDS,
-        "frameRate": 1,  # times are in seconds
-        "loopMode": "pingpong",
-        "interpolation": "spline",
-        "smoothness": 1,
-        "keyframes": {
-            "times": times,
-            "values": {
-                "position": [x for key in keys for x in key[:3]],
-                "target": [x for key in keys for x in key[3:6]],
-                "fov": [key[6] for key in keys],
-            },
-        },
-    }
