@@ -142,7 +142,7 @@ def test_from_a_dataset_to_metrics_and_images_without_printing(dataset, tmp_path
     recorder, out = Recorder(), tmp_path / "out"
     result = train(dataset, out, options(5, hold_out=8), observer=recorder)
     assert recorder.events == [
-        *("note", "note", "note", "note", "begin 0/5"),
+        *("note", "note", "note", "begin 0/5"),
         *(f"step {step}" for step in range(1, 6)),
         *("end", "trained"),
     ]
@@ -196,7 +196,7 @@ def test_photos_that_are_left_out_are_named_also_by_a_resumed_run(dataset, tmp_p
         train(dataset, tmp_path, TrainOptions(settings=settings, hold_out=8), observer=recorder)
     assert len(decided) == 1
     assert recorder.notes.count(line) == 1
-    assert recorder.events.index("note", 4) == recorder.events.index("step 7") - 1
+    assert recorder.events.index("note", 3) == recorder.events.index("step 7") - 1
 
     recorder = Recorder()
     result = resume(tmp_path, observer=recorder)

@@ -240,7 +240,7 @@ def test_a_training_without_gains_is_told_that_exposures_differ(clean, degraded,
 
     def told(folder: Path, **settings: object) -> bool:
         notes.clear()
-        options = TrainOptions(recipe="classic", settings={"iterations": 1, **settings})
+        options = TrainOptions(settings={"iterations": 1, "init": "points", **settings})
         train(folder, tmp_path / "out", options, overwrite=True, observer=observer)
         return any("no gains are learnt, because exposure is off" in note for note in notes)
 

@@ -160,10 +160,13 @@ class Project:
 
 
 def scene_at(path: Path) -> Path | None:
-    """The scene file that ``path`` is, or that a folder has or consists of; or None."""
-    if path.is_file():
-        return path if _is_scene(path) else None
-    return Project.open(path).scene
+    """The scene file that ``path`` is, or that a folder has or consists of; or None.
+
+    A zip file is none: most have photos.
+    """
+    file = path if path.is_file() else Project.open(path).scene
+    usable = file is not None and file.suffix.lower() != ".zip" and _is_scene(file)
+    return file if usable else None
 
 
 def is_output(folder: Path) -> bool:

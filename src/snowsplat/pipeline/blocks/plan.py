@@ -144,7 +144,6 @@ def plan_blocks(
 
 def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
     _check_free(folder)
-    options = replace(options, settings={"exposure": "off", **options.settings})
     config = recipe(options.recipe, **options.settings)
     if config.exposure != "off":
         raise SettingError("exposure", "would learn other gains in each block; use off")
