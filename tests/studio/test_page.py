@@ -94,7 +94,7 @@ def test_from_photos_to_a_file(studio, forked, tmp_path, monkeypatch):
         )
         page.evaluate("document.querySelector('#language').click()")
         page.wait_for("document.documentElement.lang === 'zh'")
-        page.wait_for("document.querySelector('.status')?.textContent === '已完成'", 30)
+        page.wait_for("document.querySelector('.status')?.firstChild?.textContent === '已完成'", 30)
         page.evaluate("document.querySelector('.brand').click()")
         page.wait_for("document.querySelector('.tile b')?.textContent === 'My tour'", 30)
         assert not page.errors
