@@ -58,12 +58,16 @@ class PhotoSample:
 
     Attributes:
         views: their indices in the dataset, sorted.
-        photos: (4, h, w) uint8 RGBA each. Masks are not applied: what is moving in a few photos
-            misleads no witness, and a mask may be wrong.
+        photos: (4, h, w) uint8 RGBA of each of `spread`, by index in the sample. Masks are not
+            applied: what is moving in a few photos misleads no witness, and a mask may be wrong.
+        features: of each photo, see `_features`.
+        sizes: (width, height) of each photo.
     """
 
     views: list[int]
-    photos: list[np.ndarray]
+    photos: dict[int, np.ndarray]
+    features: list[tuple[np.ndarray, np.ndarray]]
+    sizes: list[tuple[int, int]]
 
     @classmethod
     def of(cls, views: Sequence[View]) -> PhotoSample:
@@ -73,17 +77,20 @@ class PhotoSample:
         if len(views) > _MOST_VIEWS:
             first = np.linspace(0, len(views) - 2, _MOST_VIEWS // 2).round().astype(int)
             chosen = np.unique([first, first + 1])
-        decoded = _in_threads(_photo, [views[i] for i in chosen.tolist()])
-        kept = [(int(i), p) for i, p in zip(chosen, decoded, strict=True) if p is not None]
-        return cls([i for i, _ in kept], [photo for _, photo in kept])
+        found = _in_threads(lambda i: _looked_at(views[i]), chosen.tolist())
+        kept = [(i, each) for i, each in zip(chosen.tolist(), found, strict=True) if each]
+        features, sizes = ([each[k] for _, each in kept] for k in (0, 1))
+        # All photos together would take more memory than their features.
+        some = _spread(len(kept))
+        again = _in_threads(lambda k: load_thumbnail(views[kept[k][0]].image, _SIDE), some)
+        return cls([i for i, _ in kept], dict(zip(some, again, strict=True)), features, sizes)
 
     def __len__(self) -> int:
         return len(self.views)
 
     def spread(self) -> list[int]:
         """Some of the views, by their index in the sample."""
-        every = np.linspace(0, len(self) - 1, min(len(self), _SPREAD)).round().astype(int)
-        return [int(i) for i in np.unique(every)]
+        return _spread(len(self))
 
 
 @dataclass(frozen=True)
@@ -165,7 +172,6 @@ class MatchEvidence:
 
     def __init__(self, sample: PhotoSample, rig: Rig) -> None:
         self._sample = sample
-        self._features = _in_threads(_features, sample.photos)
         self._tried: set[tuple[int, int]] = set()
         self.pairs: list[Pair] = []
         count = len(sample)
@@ -213,8 +219,9 @@ class MatchEvidence:
         self.pairs += [pair for pair in matched if pair is not None]
 
     def _verified(self, a: int, b: int) -> Pair | None:
-        sizes = [self._sample.photos[i].shape[:0:-1] for i in (a, b)]
-        found = _pair_matches(self._features[a], self._features[b], sizes)
+        sample = self._sample
+        sizes = sample.sizes[a], sample.sizes[b]
+        found = _pair_matches(sample.features[a], sample.features[b], sizes)
         return None if found is None else Pair(a, b, *found)
 
 
@@ -228,11 +235,18 @@ def _in_threads(function: Callable[[_In], _Out], items: Sequence[_In]) -> list[_
         return list(pool.map(function, items))
 
 
-def _photo(view: View) -> np.ndarray | None:
+def _spread(count: int) -> list[int]:
+    every = np.linspace(0, count - 1, min(count, _SPREAD)).round().astype(int)
+    return [int(i) for i in np.unique(every)]
+
+
+def _looked_at(view: View) -> tuple[tuple[np.ndarray, np.ndarray], tuple[int, int]] | None:
+    """The features of a photo, and its width and height; None if it is damaged."""
     try:
-        return load_thumbnail(view.image, _SIDE)
+        photo = load_thumbnail(view.image, _SIDE)
     except UserError:  # the training says so, or leaves the photo out
         return None
+    return _features(photo), (photo.shape[2], photo.shape[1])
 
 
 def _near_by_pose(rig: Rig) -> Iterable[tuple[int, int]]:
@@ -247,17 +261,22 @@ def _near_by_pose(rig: Rig) -> Iterable[tuple[int, int]]:
 
 
 def _features(photo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 2) relative to the size of the photo, and unit descriptors (N, 128)."""
+    """Positions (N, 2) relative to the size of the photo, and descriptors (N, 128) uint8."""
     height, width = photo.shape[1:]
     grey = cv2.cvtColor(np.ascontiguousarray(photo[:3].transpose(1, 2, 0)), cv2.COLOR_RGB2GRAY)
     grey = np.where(photo[3] >= 128, grey, 0).astype(np.uint8)
     mask = np.where(photo[3] >= 128, 255, 0).astype(np.uint8)
     found, descriptors = cv2.SIFT_create(_FEATURES).detectAndCompute(grey, mask)  # type: ignore[attr-defined]
     if descriptors is None:
-        return np.empty((0, 2)), np.empty((0, 128), np.float32)
+        return np.empty((0, 2)), np.empty((0, 128), np.uint8)
     where = (np.array([point.pt for point in found]) + 0.5) / [width, height]
-    # The root of SIFT compares histograms better (Arandjelović and Zisserman 2012).
-    return where, np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
+    return where, descriptors.astype(np.uint8)  # OpenCV rounds them to 0 to 255
+
+
+def _unit(descriptors: np.ndarray) -> np.ndarray:
+    """Unit vectors: roots compare histograms better (Arandjelović and Zisserman 2012)."""
+    values = descriptors.astype(np.float32)
+    return np.sqrt(values / np.maximum(values.sum(1, keepdims=True), 1e-9))
 
 
 def _pair_matches(
@@ -269,7 +288,7 @@ def _pair_matches(
     and that agree with one epipolar geometry; None: too few."""
     if min(len(a[0]), len(b[0])) < _FEWEST_MATCHES:
         return None
-    similar = a[1] @ b[1].T
+    similar = _unit(a[1]) @ _unit(b[1]).T
     best = similar.argmax(1)
     rows = np.arange(len(best))
     mutual = similar.argmax(0)[best] == rows
