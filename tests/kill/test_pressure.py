@@ -21,9 +21,9 @@ CPU = ("--device", "cpu", "--threads", 1)
 
 
 @pytest.fixture(scope="module")
-def trained(runner, dataset) -> Path:
+def trained(runner, dataset, tmp_path_factory) -> Path:
     """A training run with checkpoints of steps 20 and 30; read-only for the tests."""
-    out = runner.folder / "trained"
+    out = tmp_path_factory.mktemp("of_pressure") / "trained"
     ended = runner.run(
         ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10, "--eval", *CPU]
     )

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from snowsplat.data.photos.decode import open_photo
 from snowsplat.data.photos.image_file import SCAN, segments
 from snowsplat.util.errors import Problem
 
@@ -30,6 +29,8 @@ _REDUCED = "3"  # decode at 1/2³ of the size, which is several times faster
 
 def check_pixels(path: Path) -> None:
     """Raises UserError: the image file is missing, or its data are damaged."""
+    from snowsplat.data.photos.decode import open_photo  # imports torch
+
     with open_photo(path) as image:
         if image.format == "PNG":
             image.verify()  # by its checksums
