@@ -148,14 +148,17 @@ def new_folder(path: Path) -> Iterator[Path]:
     Like the temporary file of `atomic_path`, it has the name ``path``, so that the next call
     removes what a killed process has left there, or a random one if another process holds it.
     """
+    is_new = not path.exists()
     path.mkdir(parents=True, exist_ok=True)
     handle, folder = None, path
     try:
         if path.is_symlink():
             raise NotADirectoryError(path)
         handle = _lock(path, folder=True) if fcntl is not None else None
-    except OSError:
+    except OSError as error:
         folder = Path(tempfile.mkdtemp(prefix=f"{path.name}.", dir=path.parent))
+        if is_new and not isinstance(error, BlockingIOError):  # nobody holds it
+            path.rmdir()
     try:
         for left in folder.iterdir():
             _remove(left)
@@ -233,6 +236,8 @@ def _remove(path: Path) -> None:
     """Remove a file, a link, or a folder with all that is in it, as far as that is possible."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
+        with contextlib.suppress(OSError):  # an empty one, if no file can be opened
+            path.rmdir()
     else:
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)
