@@ -318,7 +318,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads(
     try:
         for n in (1, 3):
             torch.set_num_threads(n)
-            monkeypatch.setattr("snowsplat.training.starts.photos.DECODERS", n)
+            monkeypatch.setattr("snowsplat.data.photos.image_loader.DECODERS", n)
             random = torch.Generator().manual_seed(1)
             clouds.append(swept_points(dataset, photos(dataset), 300, random))
     finally:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from snowsplat.data.lens.views import LensView, is_wide, lens_views
 from snowsplat.data.maps.map_files import MAP_SUFFIXES
 from snowsplat.data.photos.check_pixels import check_pixels
 from snowsplat.data.photos.decode import ImageSource, load_thumbnail
-from snowsplat.data.photos.image_loader import DECODERS
+from snowsplat.data.photos.image_loader import each_photo
 from snowsplat.data.readers import read_poses
 from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.scene.camera import Camera
@@ -222,14 +221,12 @@ def read_undamaged(settings: DatasetSettings) -> tuple[DatasetSettings, DatasetF
             return error
         return None
 
-    with ThreadPoolExecutor(DECODERS, thread_name_prefix="snowsplat-check") as pool:
-        found = zip(
-            files.images, pool.map(check, (image for image, _ in files.images)), strict=True
-        )
-        errors = {image.name: error for (image, _), error in found if error is not None}
+    images = [image for image, _ in files.images]
+    found = zip(images, each_photo(check, images), strict=True)
+    errors = {image.name: error for image, error in found if error is not None}
     if not errors:
         return settings, files
-    warn_of_unusable(files.root, errors, len(files.images) - len(errors))
+    warn_of_unusable(files.root, errors, len(images) - len(errors))
     settings = replace(settings, damaged=[*(settings.damaged or []), *errors])
     return settings, files.without([*errors])
 

@@ -8,7 +8,7 @@ are equal in both images, and what differs is divided by the area of the other p
 photo that is mostly masked would have an SSIM near 1, whatever the image is.
 
 The colour-aligned PSNR is measured after a gain and an offset of each channel of the image were
-fitted to the photo, see `color_alignment`. Thus it does not count that the photo has another
+fitted to the photo, see `color_fit`. Thus it does not count that the photo has another
 exposure or white balance than the scene. It is listed beside the PSNR and never replaces it.
 
 `renderings` yields the views of a scene beside their photos, at any of the sizes of `ImageLoader`.

@@ -165,7 +165,7 @@ FORMATS: list[Format] = [
         None,
         read_splat,
         write_splat,
-        "all SH, the antialiased mark, colours beyond black and white; rotations, colours and "
+        f"all SH, {_UNMARKED}, colours beyond black and white; rotations, colours and "
         "opacity have 8 bits",
     ),
     Format(

@@ -164,9 +164,10 @@ def scene_at(path: Path) -> Path | None:
 
     A zip file is none: most have photos.
     """
-    file = path if path.is_file() else Project.open(path).scene
-    usable = file is not None and file.suffix.lower() != ".zip" and _is_scene(file)
-    return file if usable else None
+    file = Project.open(path).scene
+    if file is None or file.suffix.lower() == ".zip":
+        return None
+    return file if path.is_dir() or _is_scene(file) else None
 
 
 def is_output(folder: Path) -> bool:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.data.photos.check_pixels import check_jpeg, check_pixels
+from snowsplat.data.photos.check_pixels import check_pixels
+from snowsplat.data.photos.image_file import check_jpeg
 from snowsplat.util.errors import UserError
 
 from ...sfm.pictures import photo

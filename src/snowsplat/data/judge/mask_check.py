@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from snowsplat.data.judge.rig import Rig
 from snowsplat.data.maps.mask_look import INVERT, doubt_about_masks, look_of
 from snowsplat.data.photos.decode import ImageSource, load_mask
 from snowsplat.data.photos.image_file import scaled_size
+from snowsplat.data.photos.image_loader import each_photo
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
 
@@ -28,8 +28,7 @@ def mask_findings(views: Sequence[View], points: Points | None) -> list[Finding]
     masked = [(view.camera, view.mask) for view in views if view.mask is not None]
     chosen = np.unique(np.linspace(0, len(masked) - 1, min(len(masked), _MOST_MASKS)).astype(int))
     sample = [masked[i] for i in chosen]
-    with ThreadPoolExecutor(4, thread_name_prefix="snowsplat-masks") as pool:
-        decoded = list(pool.map(lambda pair: _small(*pair), sample))
+    decoded = each_photo(lambda pair: _small(*pair), sample)
     used = [(camera, mask) for camera, mask in decoded if mask is not None]
     if not used:
         return []

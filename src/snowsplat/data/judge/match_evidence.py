@@ -10,13 +10,10 @@ agree with wrong poses by chance. The evidence of a pair is bounded by the odds 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +21,7 @@ import numpy as np
 from snowsplat.data.dataset import View
 from snowsplat.data.judge.rig import Rig
 from snowsplat.data.photos.decode import load_thumbnail
+from snowsplat.data.photos.image_loader import each_photo
 from snowsplat.scene.epipolar import LEAST_FALSE, distances_of_matches, likelihood, log_odds
 from snowsplat.util.errors import UserError
 
@@ -48,26 +46,31 @@ _MOST_NATS = math.log((1 - _FALSE) / _BY_CHANCE)
 _WRONG, _CERTAIN = 0.01, 10.0
 _PIXELS = 1600.0  # of the longer side, for `likelihood`
 
-_In = TypeVar("_In")
-_Out = TypeVar("_Out")
+
+@dataclass(frozen=True)
+class SmallPhoto:
+    """What is kept of a photo.
+
+    Attributes:
+        view: its index in the dataset.
+        size: width and height of its small copy, in pixels.
+        features: see `_features`.
+        copy: (4, h, w) uint8 RGBA, of a few photos: those of all would take more memory than their
+            features. Masks are not applied: what is moving in a few photos misleads no witness, and
+            a mask may be wrong.
+    """
+
+    view: int
+    size: tuple[int, int]
+    features: tuple[np.ndarray, np.ndarray]
+    copy: np.ndarray | None
 
 
 @dataclass(frozen=True)
 class PhotoSample:
-    """Small copies of photos of a dataset.
+    """Photos of a dataset, in the order of its views."""
 
-    Attributes:
-        views: their indices in the dataset, sorted.
-        photos: (4, h, w) uint8 RGBA of each of `spread`, by index in the sample. Masks are not
-            applied: what is moving in a few photos misleads no witness, and a mask may be wrong.
-        features: of each photo, see `_features`.
-        sizes: (width, height) of each photo.
-    """
-
-    views: list[int]
-    photos: dict[int, np.ndarray]
-    features: list[tuple[np.ndarray, np.ndarray]]
-    sizes: list[tuple[int, int]]
+    photos: list[SmallPhoto]
 
     @classmethod
     def of(cls, views: Sequence[View]) -> PhotoSample:
@@ -77,20 +80,31 @@ class PhotoSample:
         if len(views) > _MOST_VIEWS:
             first = np.linspace(0, len(views) - 2, _MOST_VIEWS // 2).round().astype(int)
             chosen = np.unique([first, first + 1])
-        found = _in_threads(lambda i: _looked_at(views[i]), chosen.tolist())
-        kept = [(i, each) for i, each in zip(chosen.tolist(), found, strict=True) if each]
-        features, sizes = ([each[k] for _, each in kept] for k in (0, 1))
-        # All photos together would take more memory than their features.
-        some = _spread(len(kept))
-        again = _in_threads(lambda k: load_thumbnail(views[kept[k][0]].image, _SIDE), some)
-        return cls([i for i, _ in kept], dict(zip(some, again, strict=True)), features, sizes)
+        every = np.linspace(0, len(chosen) - 1, min(len(chosen), _SPREAD)).round().astype(int)
+        spread = set(chosen[every].tolist())
+
+        def look_at(view: int) -> SmallPhoto | None:
+            try:
+                copy = load_thumbnail(views[view].image, _SIDE)
+            except UserError:  # the training says so, or leaves the photo out
+                return None
+            size = copy.shape[2], copy.shape[1]
+            return SmallPhoto(view, size, _features(copy), copy if view in spread else None)
+
+        return cls([each for each in each_photo(look_at, chosen.tolist()) if each is not None])
 
     def __len__(self) -> int:
-        return len(self.views)
+        return len(self.photos)
 
+    @property
+    def views(self) -> list[int]:
+        """Their indices in the dataset."""
+        return [photo.view for photo in self.photos]
+
+    @cached_property
     def spread(self) -> list[int]:
-        """Some of the views, by their index in the sample."""
-        return _spread(len(self))
+        """The photos with a copy, by their index in the sample; spread over it."""
+        return [i for i, photo in enumerate(self.photos) if photo.copy is not None]
 
 
 @dataclass(frozen=True)
@@ -183,7 +197,7 @@ class MatchEvidence:
 
     def widen(self, views: Iterable[int]) -> None:
         """Add the pairs of these views with others, wherever they are said to be."""
-        self._add((view, other) for view in views for other in self._sample.spread())
+        self._add((view, other) for view in views for other in self._sample.spread)
 
     def fit(self, rig: Rig, pairs: Sequence[Pair] | None = None) -> Fit:
         """How well cameras of the views of the sample explain the matches of (all) pairs."""
@@ -204,7 +218,7 @@ class MatchEvidence:
     def spread(self) -> list[Pair]:
         """A few of the pairs: for each of the spread views, that with the most matches."""
         chosen = {}
-        for view in self._sample.spread():
+        for view in self._sample.spread:
             own = [pair for pair in self.pairs if view in (pair.a, pair.b)]
             if own:
                 best = max(own, key=lambda pair: len(pair.in_a))
@@ -215,38 +229,17 @@ class MatchEvidence:
         new = {(min(both), max(both)) for both in candidates if both[0] != both[1]} - self._tried
         self._tried |= new
         self.__dict__.pop("spread", None)
-        matched = _in_threads(lambda both: self._verified(*both), sorted(new))
+        matched = each_photo(lambda both: self._verified(*both), sorted(new))
         self.pairs += [pair for pair in matched if pair is not None]
 
     def _verified(self, a: int, b: int) -> Pair | None:
-        sample = self._sample
-        sizes = sample.sizes[a], sample.sizes[b]
-        found = _pair_matches(sample.features[a], sample.features[b], sizes)
+        one, two = self._sample.photos[a], self._sample.photos[b]
+        found = _pair_matches(one.features, two.features, (one.size, two.size))
         return None if found is None else Pair(a, b, *found)
 
 
 def _bounded(nats: np.ndarray) -> np.ndarray:
     return nats.clip(_LEAST_NATS, _MOST_NATS)
-
-
-def _in_threads(function: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
-    workers = min(4, os.cpu_count() or 1)
-    with ThreadPoolExecutor(workers, thread_name_prefix="snowsplat-judge") as pool:
-        return list(pool.map(function, items))
-
-
-def _spread(count: int) -> list[int]:
-    every = np.linspace(0, count - 1, min(count, _SPREAD)).round().astype(int)
-    return [int(i) for i in np.unique(every)]
-
-
-def _looked_at(view: View) -> tuple[tuple[np.ndarray, np.ndarray], tuple[int, int]] | None:
-    """The features of a photo, and its width and height; None if it is damaged."""
-    try:
-        photo = load_thumbnail(view.image, _SIDE)
-    except UserError:  # the training says so, or leaves the photo out
-        return None
-    return _features(photo), (photo.shape[2], photo.shape[1])
 
 
 def _near_by_pose(rig: Rig) -> Iterable[tuple[int, int]]:

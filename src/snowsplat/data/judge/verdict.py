@@ -158,17 +158,19 @@ class _Evidence:
         fit = matches.fit(rig)
         if doubtful := fit.doubtful(len(sample)):
             few = len(doubtful) <= _MINORITY * len(sample)
-            matches.widen(doubtful if few else sample.spread())
+            matches.widen(doubtful if few else sample.spread)
             fit = matches.fit(rig)
-        spread, colours, agreement = sample.spread(), None, None
+        colours, agreement = None, None
         if points is not None and len(sample) > 1:
-            photos = [sample.photos[i] for i in spread]
+            photos = [photo.copy for photo in sample.photos if photo.copy is not None]
             colours = ColourEvidence(photos, points.xyz.numpy(), points.rgb.numpy())
-            agreement = colours.agreement(rig.select(spread)) if colours.informative() else None
+            agreement = (
+                colours.agreement(rig.select(sample.spread)) if colours.informative() else None
+            )
         odds = matches.fit(rig, matches.spread).odds()
         names = [views[i].name for i in sample.views]
         wrong = fit.wrong(len(sample))
-        return cls(names, rig, spread, matches, fit, wrong, odds, colours, agreement, far)
+        return cls(names, rig, sample.spread, matches, fit, wrong, odds, colours, agreement, far)
 
     @property
     def minority(self) -> bool:

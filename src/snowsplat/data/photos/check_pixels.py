@@ -13,24 +13,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from snowsplat.data.photos.image_file import SCAN, segments
+from snowsplat.data.photos.decode import open_photo
+from snowsplat.data.photos.image_file import check_jpeg
 from snowsplat.util.errors import Problem
 
-_SOI = b"\xff\xd8"
-# Starts of a frame that FFmpeg decodes, if a channel has 8 bits.
-_FRAMES, _BITS = (b"\xff\xc0", b"\xff\xc1", b"\xff\xc2"), 8
-# Metadata, which may have faults of their own: APP0 to APP15, but that of Adobe, and comments.
-_METADATA = {bytes([0xFF, 0xE0 + n]) for n in range(16)} - {b"\xff\xee"} | {b"\xff\xfe"}
 # Tags of a TIFF: the compression, its values for deflate, places and sizes of strips and tiles.
 _COMPRESSION, _DEFLATE, _PARTS = 259, (8, 32946), ((273, 279), (324, 325))
 _BLOCK = 1 << 20  # bytes that are unpacked at once
-_REDUCED = "3"  # decode at 1/2³ of the size, which is several times faster
 
 
 def check_pixels(path: Path) -> None:
     """Raises UserError: the image file is missing, or its data are damaged."""
-    from snowsplat.data.photos.decode import open_photo  # imports torch
-
     with open_photo(path) as image:
         if image.format == "PNG":
             image.verify()  # by its checksums
@@ -56,31 +49,3 @@ def _check_deflate(path: Path, tags: Mapping[int, Any]) -> None:
                     packed = part.unconsumed_tail
                 if not part.eof:
                     raise Problem("its data are damaged")
-
-
-def check_jpeg(path: Path) -> None:
-    """Raises ValueError: the data of a JPEG file are damaged. Other files are not checked."""
-    import av
-
-    data = path.read_bytes()
-    if not data.startswith(_SOI):
-        return
-    needed, known = [_SOI], False
-    for marker, start, end in segments(data):
-        if marker == SCAN:
-            needed.append(data[start:])
-            break
-        known |= marker in _FRAMES and data[start + 4 : start + 5] == bytes([_BITS])
-        if marker not in _METADATA:
-            needed.append(data[start:end])
-    if not known:
-        return
-    decoder = av.CodecContext.create("mjpeg", "r")
-    decoder.options = {"err_detect": "explode", "lowres": _REDUCED}
-    decoder.thread_count = 1
-    try:
-        decoder.decode(av.Packet(b"".join(needed)))
-    except av.InvalidDataError:
-        raise Problem("its data are damaged") from None
-    except av.FFmpegError:  # a kind that it does not know
-        pass

@@ -10,11 +10,11 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch
 
@@ -27,7 +27,15 @@ DECODERS = min(4, os.cpu_count() or 1)
 _DECODERS_FOR_GPU = min(8, os.cpu_count() or 1)
 _FACTORS = (1, 2, 4)
 
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 _Key = tuple[ImageSource, ImageSource | None, int]  # image, mask, downscale factor
+
+
+def each_photo(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
+    """The results of a function of photos, in the order of the items, by `DECODERS` threads."""
+    with ThreadPoolExecutor(DECODERS, thread_name_prefix="snowsplat-photos") as pool:
+        return list(pool.map(function, items))
 
 
 class Photos(Protocol):

@@ -56,11 +56,11 @@ def few_photos(count: int) -> Reason | None:
     """The reason for a worse grade that the number of photos is; None: they are enough."""
     if count >= _FEW:
         return None
-    text = message("{count} photos are few", count=count)
-    if count < _TOO_FEW:
-        text = message("{count} photos are too few", count=count)
     advice = message("take 30 to 100 photos of an object or a room, and more of a larger place")
-    return Reason("poor" if count < _TOO_FEW else "usable", text, advice, predicted=True)
+    if count < _TOO_FEW:
+        too_few = message("{count} photos are too few", count=count)
+        return Reason("poor", too_few, advice, predicted=True)
+    return Reason("usable", message("{count} photos are few", count=count), advice, predicted=True)
 
 
 def capture_verdict(

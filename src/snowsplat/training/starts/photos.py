@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from typing import TypeVar
 
@@ -13,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.decode import LoadedImage
-from snowsplat.data.photos.image_loader import DECODERS, Photos
+from snowsplat.data.photos.image_loader import Photos, each_photo
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -51,7 +50,7 @@ def _reduction(view: View, width: int) -> int:
 def in_threads(
     function: Callable[[Item], Result], items: Iterable[Item], device: torch.device
 ) -> list[Result]:
-    """The results of a function of photos, in the order of the items, by `DECODERS` threads.
+    """The results of a function of photos, in the order of the items: `each_photo`.
 
     Most of the time of a start is spent on one photo after another, by one thread: see
     `single_threaded`. Each result is computed by one thread, so it does not depend on their number.
@@ -60,8 +59,7 @@ def in_threads(
     """
     if device.type == "cuda":
         return [function(item) for item in items]
-    with ThreadPoolExecutor(DECODERS, thread_name_prefix="snowsplat-start") as pool:
-        return list(pool.map(function, items))
+    return each_photo(function, items)
 
 
 def usable_pixels(photo: LoadedImage) -> Tensor | None:

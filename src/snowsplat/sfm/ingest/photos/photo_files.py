@@ -17,9 +17,8 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
 from snowsplat.data.photos import image_file
-from snowsplat.data.photos.check_pixels import check_jpeg
 from snowsplat.data.photos.colour_profile import is_transparent, plain_pixels
-from snowsplat.data.photos.image_file import OPTIONAL_FORMATS, reason_of, scaled_size
+from snowsplat.data.photos.image_file import OPTIONAL_FORMATS, check_jpeg, reason_of, scaled_size
 from snowsplat.sfm.ingest.content.panorama import STITCHED, Panorama, panorama_in_xmp
 from snowsplat.sfm.ingest.photos.exif import ExifInfo, exif_for_copy, read_exif
 from snowsplat.util.errors import Problem
