@@ -165,9 +165,8 @@ def scene_at(path: Path) -> Path | None:
     A zip file is none: most have photos.
     """
     file = Project.open(path).scene
-    if file is None or file.suffix.lower() == ".zip":
-        return None
-    return file if path.is_dir() or _is_scene(file) else None
+    usable = file is not None and file.suffix.lower() != ".zip"
+    return file if usable and (path.is_dir() or _is_scene(path)) else None
 
 
 def is_output(folder: Path) -> bool:
