@@ -27,7 +27,7 @@ from snowsplat.training.starts.source_views import choose_views
 _RADIUS = 3
 #: The coarse sweep has one plane per pixel of displacement in the source view with the longest
 #: baseline, within these limits.
-_PLANES = (32, 128)
+_PLANES = (48, 128)
 #: The fine sweep has this number of planes around the depth of the coarse sweep, ± this number of
 #: coarse planes.
 _FINE_PLANES, _FINE_RANGE = 8, 1.0
