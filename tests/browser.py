@@ -252,14 +252,22 @@ class Page:
         return result["result"].get("value")
 
     def wait_for(self, script: str, timeout: float = 30.0) -> Any:
-        """Evaluate repeatedly until the value is true; returns it."""
+        """Evaluate repeatedly until the value is true, also in pages that follow; returns it."""
         end = time.monotonic() + timeout
-        while not (value := self.evaluate(script)):
+        while not (value := self._evaluate_between_pages(script)):
             if time.monotonic() > end:
                 shown = "\n".join(self.console)
                 raise BrowserError(f"not in {timeout:.0f} s: {script}\nconsole:\n{shown}")
             time.sleep(0.05)
         return value
+
+    def _evaluate_between_pages(self, script: str) -> Any:
+        try:
+            return self.evaluate(script)
+        except BrowserError as error:
+            if "Inspected target navigated" in str(error):
+                return None
+            raise
 
     def screenshot(self, path: Path | None = None) -> np.ndarray:
         """(H, W, 3) uint8: the content of the tab; also stored as PNG if a path is given."""
