@@ -5,71 +5,8 @@ import itertools
 import pytest
 
 from snowsplat.sfm import time_left
-from snowsplat.sfm.cost import Photos, Step, share_of_poses, steps_of
-from snowsplat.sfm.time_left import Later, SfmTimeLeft, TimeLeft
-
-STEPS = {"features": Step(60.0), "verified": Step(30.0), "poses": Step(100.0, 1)}
-
-
-class Clock:
-    """Simulates a machine; `work` finishes work of a step and tells `left` about it."""
-
-    def __init__(self, slowness: float, cores: float, threads: int = 4) -> None:
-        self.now = self.cpu = 0.0
-        self.slowness, self.cores = slowness, cores
-        self.left = TimeLeft(STEPS, threads, lambda: self.now, lambda: self.cpu)
-
-    def seconds(self, step: str, share: float = 1.0, slower: float = 1.0) -> float:
-        """The true seconds for a share of a step."""
-        work = share * STEPS[step].work * self.slowness * slower
-        return work / min(STEPS[step].threads, self.cores)
-
-    def work(self, step: str, begin: float, end: float, slower: float = 1.0) -> None:
-        parts = 20
-        self.left.update(step, begin)
-        for i in range(1, parts + 1):
-            seconds = self.seconds(step, (end - begin) / parts, slower)
-            self.now += seconds
-            self.cpu += seconds * min(STEPS[step].threads, self.cores)
-            self.left.update(step, begin + (end - begin) * i / parts)
-
-
-@pytest.mark.parametrize("slowness", [0.3, 1.0, 4.0])
-@pytest.mark.parametrize("cores", [0.6, 2.0, 4.0])
-def test_the_speed_and_the_load_of_the_machine_are_found_in_the_first_step(slowness, cores):
-    clock = Clock(slowness, cores)
-    clock.work("features", 0.0, 0.5)
-    rest = clock.seconds("features", 0.5) + clock.seconds("verified") + clock.seconds("poses")
-    assert clock.left.seconds == pytest.approx(rest, rel=0.2)
-
-
-def test_a_step_that_is_slower_than_predicted_does_not_affect_the_others():
-    clock = Clock(1.0, 2.0)
-    clock.work("features", 0.0, 1.0)
-    clock.work("verified", 0.0, 0.5, slower=3.0)
-    rest = clock.seconds("verified", 0.5, slower=3.0) + clock.seconds("poses")
-    assert clock.left.seconds == pytest.approx(rest, rel=0.1)
-
-
-def test_a_repeated_step_takes_as_long_as_before():
-    clock = Clock(1.0, 2.0)
-    for step in ("features", "verified"):
-        clock.work(step, 0.0, 1.0)
-    clock.work("poses", 0.0, 0.9, slower=2.0)
-    clock.left.update("poses", 0.5)
-    assert clock.left.seconds == pytest.approx(clock.seconds("poses", 0.5, 2.0), rel=0.1)
-
-
-def test_the_time_left_decreases_while_nothing_is_reported_and_never_ends_before_the_job():
-    clock = Clock(1.0, 2.0)
-    for step in ("features", "verified"):
-        clock.work(step, 0.0, 1.0)
-    clock.work("poses", 0.0, 0.9)
-    before = clock.left.seconds
-    clock.now += 5.0
-    assert clock.left.seconds == pytest.approx(before - 5.0)
-    clock.now += 20.0
-    assert clock.left.seconds == pytest.approx(0.25 * 25.0)
+from snowsplat.sfm.cost import Photos, Speed, share_of_poses, steps_of
+from snowsplat.sfm.time_left import Later, SfmTimeLeft
 
 
 def test_the_first_photos_of_many_take_longer():
@@ -87,6 +24,15 @@ def now(monkeypatch) -> list[float]:
     now = [1000.0]
     monkeypatch.setattr(time_left.time, "monotonic", lambda: now[0])
     return now
+
+
+STEPS_AFTER = ("pairs", "verified", "poses", "load", "images", "report")  # "features"
+
+
+def predicted() -> dict[str, float]:
+    """The seconds of each step of `of_sfm` on the reference machine."""
+    steps = steps_of(Photos(stills=50, longest=1600), None, "normal")
+    return {name: step.seconds(Speed()) for name, step in steps.items()}
 
 
 def of_sfm(**later: float) -> SfmTimeLeft:
@@ -120,10 +66,47 @@ def test_the_sum_of_the_stages(now):
     assert first_report(left, "images", 0, 50, "photos") == pytest.approx(rest, abs=0.1)
 
 
-def test_the_numbers_of_features_and_of_pairs_correct_the_prediction(now):
+def test_the_number_of_pairs_corrects_the_prediction(now):
     left = of_sfm()
-    expected = first_report(left, "poses", 0, 1225, "matched pairs")
-    left.figures(0.0, 2560.0)  # half as many features: a quarter of the work to match them
-    fewer = first_report(left, "poses", 0, 1225, "matched pairs")
-    assert fewer < expected - 0.75 * 1225 * 0.02
-    assert first_report(left, "poses", 0, 100, "matched pairs") < fewer
+    every = first_report(left, "poses", 0, 1225, "matched pairs")
+    assert first_report(left, "poses", 0, 100, "matched pairs") < every - 1125 * 0.02
+
+
+def work(left: SfmTimeLeft, now: list[float], step: str, seconds: float, begin=0.0, end=1.0):
+    """Report the share of a step from ``begin`` to ``end``, which takes ``seconds``, in parts."""
+    left.update(step, begin)
+    for part in range(1, 21):
+        now[0] += seconds / 20
+        left.update(step, begin + (end - begin) * part / 20)
+
+
+@pytest.mark.parametrize("slowness", [0.3, 1.0, 4.0])
+def test_the_finished_work_tells_the_speed_of_the_machine(now, slowness):
+    left, seconds = of_sfm(), predicted()
+    work(left, now, "features", 0.5 * slowness * seconds["features"], end=0.5)
+    rest = sum(seconds[name] for name in (*STEPS_AFTER, "features"))
+    rest -= 0.5 * seconds["features"]
+    assert left.seconds == pytest.approx(slowness * rest, rel=0.3)
+
+
+def test_a_step_that_is_slower_than_predicted_hardly_affects_the_others(now):
+    left, seconds = of_sfm(), predicted()
+    work(left, now, "features", seconds["features"])
+    work(left, now, "pairs", 3 * 0.5 * seconds["pairs"], end=0.5)
+    rest = 1.5 * seconds["pairs"] + sum(seconds[name] for name in STEPS_AFTER[1:])
+    assert rest <= left.seconds < 2.0 * rest
+    left.update("verified", 0.0)
+    work(left, now, "poses", 2 * 0.9 * seconds["poses"], end=0.9)
+    left.update("poses", 0.5)  # another attempt takes as long as the one before
+    rest = seconds["poses"] + sum(seconds[name] for name in STEPS_AFTER[3:])
+    assert left.seconds == pytest.approx(rest, rel=0.5)
+
+
+def test_the_time_left_decreases_while_nothing_is_reported_and_never_ends_before_the_job(now):
+    left = of_sfm()
+    work(left, now, "report", 2.0, end=0.5)
+    before = left.seconds
+    now[0] += 0.5 * before
+    assert left.seconds == pytest.approx(0.5 * before)
+    now[0] += 20.0
+    assert left.seconds == pytest.approx(0.25 * (20.0 + 0.5 * before))

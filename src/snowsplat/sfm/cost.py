@@ -165,7 +165,7 @@ def steps_of(photos: Photos, size: int | None, effort: EffortName) -> dict[str, 
         "videos": Step(photos.decoded * _FRAME_MEGAPIXEL * _megapixels(photos.video), 1),
         "photos": Step(reading, _MOST_READERS),
         "features": Step(count * (detecting + _SIFT_THOUSAND * parameters.features / 1000)),
-        **steps_of_pairs(expected_pairs(count, effort), parameters.features),
+        **steps_of_pairs(_expected_pairs(count, effort), effort),
         "poses": Step(_registration(count, count) + _REFINED * count, 1),
         "load": Step(_LOAD, 1),
         "images": Step(_IMAGE_MEGAPIXEL * copy * count, _MOST_READERS),
@@ -178,9 +178,9 @@ def predicted_seconds(photos: Photos, size: int | None, effort: EffortName, spee
     return sum(step.seconds(speed) for step in steps_of(photos, size, effort).values())
 
 
-def steps_of_pairs(pairs: float, features: float) -> dict[str, Step]:
-    """The steps "pairs" and "verified" for this number of pairs, and of features in a photo."""
-    thousands = features / 1000
+def steps_of_pairs(pairs: float, effort: EffortName) -> dict[str, Step]:
+    """The steps "pairs" and "verified" for this number of pairs."""
+    thousands = EFFORTS[effort].features / 1000
     return {
         "pairs": Step(_MATCHED_PAIR * pairs * thousands**2),
         "verified": Step(_VERIFIED_PAIR * pairs * math.sqrt(thousands)),
@@ -199,7 +199,7 @@ def _registration(registered: int, photos: int) -> float:
     return _REGISTERED * first + _ADDED * (registered - first)
 
 
-def expected_pairs(count: int, effort: EffortName) -> float:
+def _expected_pairs(count: int, effort: EffortName) -> float:
     """About how many pairs of ``count`` photos are matched; see `pairs.choose_pairs`."""
     parameters = EFFORTS[effort]
     if count <= parameters.exhaustive:

@@ -158,8 +158,7 @@ def _run(
     def find_poses(report: Report) -> dict[str, Any]:
         if options.skip_matching:
             return asdict(describe_model(folder, photos))
-        watchers = report, left.figures, watcher.show_poses
-        return asdict(estimate_poses(folder, photos, options.sfm, *watchers))
+        return asdict(estimate_poses(folder, photos, options.sfm, report, watcher.show_poses))
 
     settings = {k: v for k, v in asdict(options.sfm).items() if k not in ("threads", "seconds")}
     stage(

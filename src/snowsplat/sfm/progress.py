@@ -29,11 +29,6 @@ def silent(done: int, total: int, what: str = "", left: float | None = None) -> 
     """A `Report` that does nothing."""
 
 
-#: Receives the processor time in seconds of the child process that estimates the poses, and the
-#: mean number of features of a photo; 0: not known yet.
-Figures = Callable[[float, float], None]
-
-
 class ShowPoses(Protocol):
     """Receives the photos that have a pose so far, and some points (P, 3), every two seconds.
 

@@ -59,15 +59,6 @@ def test_ready_photos_are_linked_unchanged(tmp_path):
     assert not (tmp_path / "out" / "distorted").exists()
 
 
-def test_brackets_of_exposures_are_reported(tmp_path):
-    root = write_photos(tmp_path / "p", 4)
-    for path in list(root.iterdir()):
-        dark = Image.open(path).point(lambda level: level // 2)
-        dark.save(path.with_name(f"{path.stem}_dark.jpg"), quality=95)
-    (line,) = gathered(root, tmp_path / "out").notes
-    assert line.startswith("8 photos show 4 views")
-
-
 def test_formats_unknown_to_colmap_are_converted_and_upright(tmp_path):
     pillow_heif.register_heif_opener()
     root = write_photos(tmp_path / "p", 1)

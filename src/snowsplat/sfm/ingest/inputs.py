@@ -110,14 +110,7 @@ def gather(
     notes: list[str] = []
     _check_disk_space(dataset, planned, clips, options)
     try:
-        photos, looks, brackets = write_photos(
-            planned, dataset, options.size, in_place, left_out, report
-        )
-        if brackets:
-            notes.append(
-                f"{len(photos)} photos show {len(photos) - brackets} views, some at several "
-                "exposures (brackets): photos from more places make a better scene"
-            )
+        photos, looks = write_photos(planned, dataset, options.size, in_place, left_out, report)
         photos = _with_panoramas(photos)
         for (source, clip), panorama in zip(clips, around, strict=True):
             photos += _take_frames(source, clip, folder, options, panorama, left_out, notes, report)

@@ -129,7 +129,7 @@ def test_a_clock_is_masked_with_the_digits_that_change():
     assert parts.overlays[pixels].all()
     assert parts.fixed.mean() < 0.15
     (line,) = describe(parts, False, "all 12 photos")
-    assert line.startswith("something at the lower left")
+    assert line.startswith("something does not move")
     assert "masked in all 12 photos" in line
 
 

@@ -103,7 +103,7 @@ def test_a_logo_is_masked_together_with_the_masks_of_the_user(tmp_path):
     assert not first[-30:].any()
     assert second[-30:].all()
     (note,) = made.notes
-    assert note.startswith("something at the upper left")
+    assert note.startswith("something does not move")
 
 
 def test_five_photos_and_transparent_photos_are_left_alone(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.video.motion import FrameMotion, has_moved, is_bracket
+from snowsplat.sfm.ingest.video.motion import FrameMotion, has_moved
 
 from ...pictures import blurred, grey, noisy, pan, wall
 
@@ -41,14 +41,6 @@ def test_a_moving_object_is_not_camera_motion():
 
 def test_a_change_of_light_is_not_camera_motion():
     assert not has_moved(grey(wall()), grey((wall() * 0.8).astype(np.uint8)))
-
-
-@pytest.mark.parametrize(
-    ("gain", "step", "expected"), [(0.6, 0, True), (1.0, 0, False), (0.6, 12, False)]
-)
-def test_a_bracket_is_one_view_at_two_exposures(gain, step, expected):
-    first, second = (grey(frame) // 2 for frame in pan(2, step=step))
-    assert is_bracket(first, (gain * second).astype(np.uint8)) == expected
 
 
 def test_images_without_texture_and_tiny_images():

@@ -43,12 +43,10 @@ _STEP = 0.5  # pixels of a view, for the derivative of the positions
 class WorkerProgress:
     """The functions with which the worker sends its progress to the parent process.
 
-    ``report`` sends a number of finished items. ``features`` is called with the mean number of
-    features of the photos, ``show_poses`` as `PoseMessages`.
+    ``report`` sends a number of finished items, ``show_poses`` is as `PoseMessages`.
     """
 
     report: Report
-    features: Callable[[float], None] = lambda mean: None
     show_poses: Callable[[pycolmap.Reconstruction, bool], None] = lambda model, now: None
 
 
@@ -71,20 +69,16 @@ def extract_features(
 
     at_once = photos_at_once(effort.image_size, threads)
     with closing_database(database) as opened, ThreadPoolExecutor(at_once) as pool:
-        counts = []
         left = [i for i in range(len(photos)) if not opened.exists_descriptors(i + 1)]
         found = pool.map(detect, [photos[i] for i in left])
         for done, (i, features) in enumerate(zip(left, found, strict=True)):
             progress.report(len(photos) - len(left) + done, len(photos), "photos with features")
-            counts.append(len(features.descriptors))
             transaction = pycolmap.DatabaseTransaction(opened)
             opened.write_keypoints(i + 1, features.keypoints)
             sift = pycolmap.FeatureExtractorType.SIFT
             descriptors = pycolmap.FeatureDescriptors(sift, features.descriptors)
             opened.write_descriptors(i + 1, descriptors)
             del transaction  # ends it
-        if counts:
-            progress.features(sum(counts) / len(counts))
         progress.report(len(photos), len(photos), "photos with features")
 
 

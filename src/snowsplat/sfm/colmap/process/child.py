@@ -19,7 +19,7 @@ from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmResult, thread_count
 from snowsplat.sfm.colmap.process.growing_map import read_poses
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import MIN_PHOTOS, SfmOptions
-from snowsplat.sfm.progress import Figures, Report, ShowPoses
+from snowsplat.sfm.progress import Report, ShowPoses
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.limited_child import child_environment
 from snowsplat.util.messages import as_message, message
@@ -28,7 +28,7 @@ from snowsplat.util.messages import as_message, message
 _DATABASE_GROWTH = 8_000_000
 _MODULE = "snowsplat.sfm.colmap.process.worker"
 _POLL_SECONDS = 0.5
-_Watchers = tuple[Report, Figures, ShowPoses]
+_Watchers = tuple[Report, ShowPoses]
 
 
 def estimate_poses(
@@ -36,7 +36,6 @@ def estimate_poses(
     photos: list[Photo],
     options: SfmOptions,
     report: Report,
-    figures: Figures = lambda cpu_seconds, features: None,
     show_poses: ShowPoses = lambda photos, points: None,
 ) -> SfmResult:
     """Estimate the pose of each photo in ``input/`` of a dataset, and points of the scene.
@@ -48,8 +47,8 @@ def estimate_poses(
     settings lead to the same pairs and matches, and to the same poses except for rounding. With
     more than 150 photos, the coordinate frame may differ, too.
 
-    ``report`` is called at least twice per second, also if nothing has changed. ``figures`` is
-    called as often as there is progress, ``show_poses`` every two seconds while photos get poses.
+    ``report`` is called at least twice per second, also if nothing has changed, ``show_poses``
+    every two seconds while photos get poses.
 
     Raises:
         UserError: fewer than 3 photos, an unknown camera model, no poses found (the message
@@ -77,7 +76,7 @@ def estimate_poses(
         "photos": [dataclasses.asdict(photo) for photo in photos],
         "options": dataclasses.asdict(options),
     }
-    watchers, crashes = (report, figures, show_poses), list[int]()
+    watchers, crashes = (report, show_poses), list[int]()
     for threads in (thread_count(options.threads), 1):
         result = _run({**job, "reduced": bool(crashes)}, log, threads, watchers)
         if isinstance(result, SfmResult):
@@ -158,7 +157,7 @@ def _communicate(
     ``report`` is called in this thread, so it needs no lock and Ctrl-C interrupts it. A second
     thread reads the lines.
     """
-    report, figures, show_poses = watchers
+    report, show_poses = watchers
     lines: queue.Queue[str | None] = queue.Queue()
 
     def listen() -> None:
@@ -191,7 +190,6 @@ def _communicate(
             continue
         answer = message
         if "progress" in answer:
-            figures(answer["cpu"], answer["features"])
             report(*answer["progress"])
     # stdin is closed only after the last answer, because the child ends when its stdin is closed.
     with contextlib.suppress(BrokenPipeError):

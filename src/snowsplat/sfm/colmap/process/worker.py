@@ -3,10 +3,10 @@
     python -m snowsplat.sfm.colmap.process.worker
 
 The parent sends the job as one line of JSON to stdin. The child answers with lines of JSON on
-stdout: its progress, with its processor time and the number of features; the photos that have a
-pose so far; and at the end the result or a `UserError`. Stdin stays open as long as the parent
-runs; when it closes, the child ends immediately. The child ignores Ctrl-C, which the parent
-handles. The output of COLMAP goes to stderr, which the parent redirects to a log file.
+stdout: its progress; the photos that have a pose so far; and at the end the result or a
+`UserError`. Stdin stays open as long as the parent runs; when it closes, the child ends
+immediately. The child ignores Ctrl-C, which the parent handles. The output of COLMAP goes to
+stderr, which the parent redirects to a log file.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
@@ -48,19 +47,16 @@ def main() -> None:
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
-    figures = {"features": 0.0}
-
     def send(**line: Any) -> None:
         answers.write(json.dumps(line) + "\n")
         answers.flush()
 
     def report(done: int, total: int, what: str = "", left: float | None = None) -> None:
-        send(progress=(done, total, what), cpu=time.process_time(), **figures)
+        send(progress=(done, total, what))
 
     try:
         progress = WorkerProgress(
             report=report,
-            features=lambda mean: figures.update(features=mean),
             show_poses=PoseMessages(lambda message: send(poses=message)),
         )
         send(result=asdict(_run(job, progress)))

@@ -18,7 +18,6 @@ The black outside of an image circle is found first (`image_circle`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -66,7 +65,6 @@ _AROUND = 8  # pixels: edges at most this far from a fixed edge are around it
 _MIN_EDGES = 40  # pixels of fixed edges in an overlay
 _GAP = 12  # pixels: gap between two words of a text
 _BLUR = np.ones((9, 9), np.uint8)  # what is masked around a fixed edge: its blur is fixed, too
-_PART_OF_ALL = 0.15  # of the overlays: a smaller part is not named
 _TEXT_HEIGHT = 0.12  # of the height of the frame; higher overlays are no line of text
 # The last digits of a clock change, so that they have no fixed edges. This number of times the
 # height of a text is masked beside it.
@@ -79,12 +77,6 @@ _ALL_OF_IT = 0.5  # share of the picture; if more does not move, it is the camer
 # A part of the frame that an overlay encloses is masked, too, if its pixels change less than this
 # fraction of the scene's, or if it is smaller than this fraction of the frame.
 _CALM, _SMALL = 0.5, 0.02
-
-_GRID = (
-    ("upper left", "top", "upper right"),
-    ("left", "centre", "right"),
-    ("lower left", "bottom", "lower right"),
-)
 
 #: Left, top, right and bottom of a part of a picture, as fractions of its width and height.
 Crop = tuple[float, float, float, float]
@@ -315,7 +307,7 @@ def _with_enclosed(found: NDArray[np.bool_], copies: NDArray[np.uint8]) -> NDArr
 def describe_bars(parts: FixedParts, cropped: bool, where: str) -> str:
     """Where the bars are, and what was done about them; ``where``: e.g. "all 14 photos"."""
     names = ("left", "top", "right", "bottom")
-    sides = _list_of([name for name, width in zip(names, parts.bars, strict=True) if width])
+    sides = " and ".join(name for name, width in zip(names, parts.bars, strict=True) if width)
     bars = "a bar" if sum(map(bool, parts.bars)) == 1 else "bars"
     return f"{bars} at the {sides}: {'cut off' if cropped else 'masked'} in {where}"
 
@@ -333,24 +325,7 @@ def describe(parts: FixedParts, cropped: bool, where: str) -> list[str]:
         )
     elif parts.overlays.any():
         lines.append(
-            f"something at the {_places(parts.overlays)} does not move with the scene (a time "
-            f"stamp, a logo, a part of the camera or car): masked in {where}"
+            "something does not move with the scene (a time stamp, a logo, a part of the camera "
+            f"or car): masked in {where}"
         )
     return lines
-
-
-def _places(overlays: NDArray[np.bool_]) -> str:
-    """Where the overlays are: "upper left and bottom"."""
-    height, width = overlays.shape
-    names = []
-    for row, line in enumerate(_GRID):
-        for column, name in enumerate(line):
-            rows = slice(row * height // 3, (row + 1) * height // 3)
-            columns = slice(column * width // 3, (column + 1) * width // 3)
-            if overlays[rows, columns].sum() >= _PART_OF_ALL * overlays.sum():
-                names.append(name)
-    return _list_of(names)
-
-
-def _list_of(names: Sequence[str]) -> str:
-    return ", ".join(names[:-1]) + (" and " if len(names) > 1 else "") + names[-1]

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -37,7 +36,6 @@ from snowsplat.sfm.ingest.photos.photo_files import (
 )
 from snowsplat.sfm.ingest.search.names import free_name
 from snowsplat.sfm.ingest.search.sources import Source
-from snowsplat.sfm.ingest.video.motion import BRACKET_SIDE, is_bracket
 from snowsplat.sfm.options import GatherOptions
 from snowsplat.sfm.progress import Report, in_threads
 from snowsplat.util.files import shown
@@ -106,44 +104,38 @@ def write_photos(
     in_place: bool,
     left_out: list[LeftOut],
     report: Report,
-) -> tuple[list[Photo], list[MaskLook], int]:
+) -> tuple[list[Photo], list[MaskLook]]:
     """Write photos to ``input/``, and their masks to ``distorted/masks``, in up to four threads.
 
     Each thread has one photo in memory. The photos have the order of ``planned``, and so have the
     looks of the masks of some of them. Photos that cannot be used are appended to ``left_out``.
-    The number is that of the photos with the view of the photo before at another exposure.
 
     Args:
         longest: largest allowed longest side in pixels; None: any.
         in_place: the photos are in ``input/`` already; write only the masks.
     """
 
-    def work(plan: Planned) -> _Written | Message:
+    def work(plan: Planned) -> tuple[Photo, MaskLook | None] | Message:
         try:
             return _write_photo(plan, dataset, longest, in_place)
         except Unusable as error:
             return error.message
 
-    written = list[_Written]()
+    photos, looks = list[Photo](), list[MaskLook]()
     made = in_threads(work, planned, min(4, os.cpu_count() or 1), report)
     for plan, outcome in zip(planned, made, strict=True):
         if isinstance(outcome, Message):
             left_out.append(not_used(plan.source.path, outcome))
-        else:
-            written.append(outcome)
-    brackets = sum(is_bracket(one.copy, two.copy) for one, two in pairwise(written))
-    looks = [each.look for each in written if each.look is not None]
-    return [each.photo for each in written], looks, brackets
+            continue
+        photo, look = outcome
+        photos.append(photo)
+        looks += [] if look is None else [look]
+    return photos, looks
 
 
-@dataclass(frozen=True)
-class _Written:
-    photo: Photo
-    look: MaskLook | None
-    copy: np.ndarray  # (H, W) uint8 grey, of `BRACKET_SIDE`
-
-
-def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bool) -> _Written:
+def _write_photo(
+    plan: Planned, dataset: Path, longest: int | None, in_place: bool
+) -> tuple[Photo, MaskLook | None]:
     source, header = plan.source, plan.header
     target = DatasetFolder(dataset).photos / plan.name
     ready = header.is_ready(longest)
@@ -200,4 +192,4 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
         turned=header.turned,
     )
     look = None if used is None or source.mask is None else look_of(used)
-    return _Written(photo, look, grey_copy(Image.fromarray(grey), BRACKET_SIDE))
+    return photo, look

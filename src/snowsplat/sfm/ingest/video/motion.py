@@ -31,11 +31,6 @@ _NEW_REFERENCE = 5.0
 # `_NEW_REFERENCE`.
 _MIN_AGREEMENT = 0.25
 
-#: Longest side in pixels of the copies for `is_bracket`.
-BRACKET_SIDE = 160
-# Of the mean grey levels: cameras bracket in steps of a third of an EV or more.
-_BRACKET = 2 ** (1 / 3 / 2.2)
-
 
 def has_moved(before: np.ndarray, after: np.ndarray, fixed: np.ndarray | None = None) -> bool:
     """Whether the camera moved between two frames, given equally large copies of `CONTENT_SIDE`.
@@ -49,21 +44,6 @@ def has_moved(before: np.ndarray, after: np.ndarray, fixed: np.ndarray | None = 
     if not textured.any():
         return bool(np.abs(first - second).mean() >= 1.0)
     return _shift(_spectrum(first[textured]), _spectrum(second[textured]))[0] >= _MOVED
-
-
-def is_bracket(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether two copies of `BRACKET_SIDE` show one view at two exposures."""
-    if before.shape != after.shape or min(before.shape) < _BLOCK:
-        return False
-    dark, bright = sorted((float(before.mean()), float(after.mean())))
-    if bright < _BRACKET * dark:
-        return False
-    first, second = _blocks(before, None), _blocks(after, None)
-    textured = _textured(first) & _textured(second)
-    if not textured.any():
-        return False
-    shift, agreement = _shift(_spectrum(first[textured]), _spectrum(second[textured]))
-    return shift == 0 and agreement >= _MIN_AGREEMENT  # whole pixels
 
 
 class FrameMotion:
