@@ -30,12 +30,7 @@ from snowsplat.training.core import checkpoint
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts import exposure_start as module
 from snowsplat.training.parts.exposure import Exposure
-from snowsplat.training.parts.exposure_start import (
-    GAMMA,
-    exposure_start,
-    log_gains,
-    same_everywhere,
-)
+from snowsplat.training.parts.exposure_start import GAMMA, exposure_start, log_gains
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
 from snowsplat.training.processes.shards import ALONE
 from snowsplat.training.settings.recipes import recipe
@@ -108,20 +103,33 @@ def test_photos_with_too_few_points_have_no_gain():
     assert found[2].isnan().all()
 
 
-def everywhere(logs: torch.Tensor, half: torch.Tensor) -> bool:
-    return same_everywhere(logs, half, log_gains(logs[:, half]), log_gains(logs[:, ~half]))
+def points_start(logs: Tensor, xyz: Tensor, monkeypatch) -> module.ExposureStart:
+    """The exposures of photos with these colours (V, P, 3) of points (P, 3)."""
+    monkeypatch.setattr(module, "_log_colors", lambda views, points, step, images: logs)
+    views = [SimpleNamespace(image=SimpleNamespace(path=Path("no photo")))] * len(logs)
+    return exposure_start(
+        SimpleNamespace(train=views, points=Points(xyz, torch.zeros(len(xyz), 3))), None
+    )
 
 
-def test_shiny_surfaces_are_no_exposure():
-    """Half of the points shine, by another amount in each photo; or all points are brighter."""
+@pytest.mark.parametrize(
+    ("everywhere", "on_sides", "same"),
+    [(0.2, 0.0, True), (0.2, 0.05, True), (0.2, 0.2, False), (0.0, 0.2, False), (0.0, 0.0, False)],
+)
+def test_shiny_surfaces_are_no_exposure(everywhere, on_sides, same, monkeypatch):
+    """Photos are brighter in all parts of the scene, and differ on its two sides, as on a table
+    that reflects a window and a wall.
+    """
     generator = torch.Generator().manual_seed(0)
-    noise = 0.05 * torch.randn(12, 400, 3, generator=generator, dtype=torch.float64)
-    logs = torch.rand(400, 3, generator=generator, dtype=torch.float64) - 1.0 + noise
-    half = torch.arange(400) % 2 == 0
-    brighter = 0.2 * torch.randn(12, 1, 1, generator=generator, dtype=torch.float64)
-    assert everywhere(logs + brighter, half)
-    assert not everywhere(logs + brighter * half[:, None], half)
-    assert not everywhere(logs, half)
+    xyz = torch.rand(1000, 3, generator=generator)
+    noise = 0.05 * torch.randn(12, 1000, 3, generator=generator, dtype=torch.float64)
+    logs = torch.rand(1000, 3, generator=generator, dtype=torch.float64) - 1.5 + noise
+    brighter = torch.randn(2, 12, 1, 1, generator=generator, dtype=torch.float64)
+    logs = logs + everywhere * brighter[0]
+    logs += on_sides * brighter[1] * torch.where(xyz[:, :1] < 0.5, 1.0, -1.0)
+    start = points_start(logs, xyz, monkeypatch)
+    assert start.everywhere == same
+    assert start.spread > 0.05 or not everywhere
 
 
 def test_the_exposures_of_a_dataset(clean, degraded, gains):
@@ -141,21 +149,11 @@ def test_photos_that_show_few_points_do_not_hide_the_exposures_of_others(
     generator = torch.Generator().manual_seed(2)
     xyz = torch.rand(5000, 3, generator=generator)
     true = 0.2 * torch.randn(known, 3, generator=generator, dtype=torch.float64)
-    steps = []
-
-    def log_colors(views, points, step, images):
-        steps.append(step)
-        logs = torch.full((60, len(points[::step]), 3), torch.nan, dtype=torch.float64)
-        logs[:known] = -1.0 + true[:, None]
-        logs[:known] += 0.02 * torch.randn(logs[:known].shape, generator=generator)
-        return logs
-
-    monkeypatch.setattr(module, "_log_colors", log_colors)
-    views = [SimpleNamespace(image=SimpleNamespace(path=Path("no photo")))] * 60
-    dataset = SimpleNamespace(train=views, points=Points(xyz, torch.zeros(5000, 3)))
+    logs = torch.full((60, 1000, 3), torch.nan, dtype=torch.float64)
+    logs[:known] = -1.0 + true[:, None]
+    logs[:known] += 0.02 * torch.randn(logs[:known].shape, generator=generator)
     monkeypatch.setattr(module, "exif_exposure", lambda path: None)
-    start = exposure_start(dataset, None)
-    assert steps == [5]
+    start = points_start(logs, xyz, monkeypatch)
     assert (start.spread is not None) == enough
     if enough:
         assert start.everywhere

@@ -10,13 +10,14 @@ least squares with the weight of Geman and McClure, which ignores observations t
 example of points that are hidden or reflect light. Without enough points, the exposures in EXIF
 data are used if all photos have them.
 
-The gains are also fitted to two halves of the points, which lie in alternating cubes of space.
-Noise differs between the halves, but an exposure is the same in both. Thus the covariance of the
-two results is the variance of the exposures.
+The gains are also fitted to two halves of the points, every second one. Noise differs between the
+halves, but an exposure is the same in both. Thus the covariance of the two results is the variance
+of the exposures.
 
-Shiny surfaces are brighter from some places, too. But such differences are others in other parts of
-the scene. So the gains of each half are applied to the colours of the other half: an exposure makes
-the colours of the same point in several photos more alike there, too.
+Shiny surfaces and the light of a window are brighter from some places, too. But such differences
+are others in other parts of the scene. So the scene is divided into octants. What is left of the
+colours of an octant without the gains, as a median for each photo, must vary much less than the
+gains. Again, this variance is the covariance of two halves.
 """
 
 from __future__ import annotations
@@ -57,11 +58,12 @@ _LEAST_WEIGHT = 20.0
 #: The exposures are known if this share of the photos has enough observations, or this number:
 #: then those of the others are assumed to be the mean.
 _LEAST_SHARE, _ENOUGH = 0.7, 20
-#: The colours of the other half must differ by at most this factor of before. In photos with fixed
-#: exposure, the factor is 0.98 to 1.03; in photos with automatic exposure, 0.4 to 0.85.
-_MORE_ALIKE = 0.9
-#: Number of cubes along the longest side of the points, for the two halves.
-_CUBES = 6
+#: The variance of what is left in the octants, relative to that of the gains, is at most this. In
+#: photos where gains help it is 0.0 to 0.17, in photos with fixed exposure or gloss 0.34 to 15.
+_MOST_LEFT = 0.25
+#: The scene is divided along so many frames of axes, half of an octant has so many colours in a
+#: photo, and this share of the products of the medians of two halves is ignored at either end.
+_FRAMES, _LEAST_COLORS, _TRIMMED = 6, 8, 0.05
 
 
 @dataclass(frozen=True)
@@ -97,15 +99,14 @@ def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
         xyz = dataset.points.xyz.cpu()
         most = min(_SAMPLE_OF_PHOTO * len(views), _MOST_COLORS // len(views))
         step = -(-len(xyz) // max(_SAMPLE, most))
-        logs, half = _log_colors(views, xyz, step, images), _half(xyz[::step])
-        half = half.to(logs.device)
-        whole, one, other = log_gains(logs), log_gains(logs[:, half]), log_gains(logs[:, ~half])
-        products = one * other
+        logs = _log_colors(views, xyz, step, images)
+        products = log_gains(logs[:, ::2]) * log_gains(logs[:, 1::2])
         if int(products.isfinite().sum()) > 3 * min(_LEAST_SHARE * len(views), _ENOUGH):
-            spread = GAMMA / math.log(2.0) * math.sqrt(max(0.0, float(products.nanmean())))
+            whole, variance = log_gains(logs), max(0.0, float(products.nanmean()))
+            left = variance_left(logs - whole[:, None], xyz[::step].to(logs.device))
             gains = (whole - whole.nanmean(0)).nan_to_num().to("cpu", torch.float32)
-            everywhere = same_everywhere(logs, half, one, other)
-            return ExposureStart(gains, spread, message("points"), everywhere)
+            spread = GAMMA / math.log(2.0) * math.sqrt(variance)
+            return ExposureStart(gains, spread, message("points"), left <= _MOST_LEFT * variance)
     values = [exif_exposure(view.image.path) for view in views]
     known = [value for value in values if value is not None]
     if len(views) > 1 and len(known) == len(views):
@@ -146,39 +147,37 @@ def _visible(camera: Camera, xyz: Tensor) -> Tensor:
     return inside & (depth <= _NEARER * nearest[key])
 
 
-def _half(xyz: Tensor) -> Tensor:
-    """(P,) bool: the points in every second of the cubes, as on a chessboard."""
-    low, high = xyz.quantile(torch.tensor([0.05, 0.95]), dim=0)
-    side = (high - low).max().clamp_min(1e-12) / _CUBES
-    return (xyz / side).floor().sum(1) % 2 == 0
-
-
-def same_everywhere(logs: Tensor, half: Tensor, one: Tensor, other: Tensor) -> bool:
-    """Whether the gains of one half of the points make the colours of the other half more alike.
+def variance_left(logs: Tensor, xyz: Tensor) -> float:
+    """The variance of the colours of parts of the scene over the photos, beyond that of noise.
 
     Args:
-        logs: (V, P, 3) float64, logs of colours; NaN where the colour is not known.
-        half: (P,) bool.
-        one, other: `log_gains` of the points in ``half``, and of the others.
+        logs: (V, P, 3) float64, logs of colours without the gains; NaN where they are not known.
+        xyz: (P, 3) positions of the points.
+
+    Returns: NaN if no part has enough points.
     """
-    parts = logs[:, half], logs[:, ~half]
-    before = sum(_unlike(part) for part in parts)
-    after = _unlike(parts[0], other) + _unlike(parts[1], one)
-    return after <= _MORE_ALIKE * before
-
-
-def _unlike(logs: Tensor, gains: Tensor | None = None) -> float:
-    """The median difference between the log-colours of a point and their median over the photos.
-
-    Args:
-        logs: (V, P, 3), NaN where the colour is not known.
-        gains: (V, 3) log-gains that are subtracted first; None, NaN: none.
-    """
-    if gains is not None:
-        logs = logs - gains.nan_to_num()[:, None]
     # The median of two colours is one of them, so it would not differ.
     logs = torch.where(logs.isfinite().sum(0) >= 3, logs, torch.nan)
-    return float((logs - logs.nanmedian(0).values).abs().nanmedian())
+    rest = logs - logs.nanmedian(0).values
+    generator, found = torch.Generator().manual_seed(0), [logs.new_zeros(0)]
+    for _ in range(_FRAMES):
+        axes = torch.linalg.qr(torch.randn(3, 3, generator=generator))[0]
+        along = xyz @ axes.to(xyz)
+        octant = ((along > along.median(0).values) * along.new_tensor([1, 2, 4])).sum(1)
+        for number in range(8):
+            part = rest[:, octant == number]
+            if part.shape[1] >= 2 * _LEAST_COLORS:
+                found.append((_medians(part[:, ::2]) * _medians(part[:, 1::2])).flatten())
+    products = torch.cat(found)
+    products = products[products.isfinite()].sort().values
+    few = int(_TRIMMED * len(products))
+    return float(products[few : len(products) - few].mean())
+
+
+def _medians(colors: Tensor) -> Tensor:
+    """(V, 3): the medians over the points of colours (V, P, 3); NaN where too few are known."""
+    enough = colors.isfinite().sum(1) >= _LEAST_COLORS
+    return torch.where(enough, colors.nanmedian(1).values, torch.nan)
 
 
 def log_gains(logs: Tensor) -> Tensor:
