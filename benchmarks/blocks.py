@@ -37,7 +37,7 @@ from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.files import write_json
-from snowsplat.util.process_memory import peak_bytes, reset_peak, resident_bytes
+from snowsplat.util.machine import peak_bytes, reset_peak, resident_bytes
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

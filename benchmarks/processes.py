@@ -37,7 +37,7 @@ from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.processes.process_shards import ProcessShards
 from snowsplat.training.processes.shards import Shards
 from snowsplat.training.settings.recipes import recipe
-from snowsplat.util.process_memory import peak_bytes, reset_peak, resident_bytes
+from snowsplat.util.machine import peak_bytes, reset_peak, resident_bytes
 
 #: Number of updates before the measurement, and of measured ones.
 WARM_UP, MEASURED = 2, 6

@@ -334,7 +334,7 @@ def test_a_lens_for_each_frame(tmp_path):
         ({"k2": float("nan")}, "frame 0: k2 should be a number"),
         ({"k1": -90.0}, "lens distortion"),
         ({"k4": -1e6}, r"lens distortion \(BROWN"),
-        ({"camera_model": "FISHEYE624"}, "frame 0: distortion_params should be 12 numbers"),
+        ({"camera_model": "FISHEYE624"}, "frame 0: distortion_params: should be 12 numbers"),
         ({"camera_model": "OPENCV", "distortion_params": [0.1]}, "should be 6 numbers"),
     ],
 )

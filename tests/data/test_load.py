@@ -12,8 +12,8 @@ from PIL import Image
 
 from snowsplat import data
 from snowsplat.data import ImageLoader, Points, load_dataset, read_files
-from snowsplat.data.dataset import safe_name, scene_extent
-from snowsplat.data.frame.bounds import scene_bounds
+from snowsplat.data.dataset import safe_name
+from snowsplat.data.frame.bounds import scene_bounds, scene_extent
 from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import SettingError, UserError

@@ -30,8 +30,7 @@ from PIL import Image
 from pillow_heif import register_heif_opener
 
 from snowsplat.data import load_dataset
-from snowsplat.data.maps.mask_look import doubt_about_files
-from snowsplat.data.maps.mask_pixels import looks_like_mask
+from snowsplat.data.maps.mask_pixels import doubt_about_files, looks_like_mask
 from snowsplat.data.photos.colour_profile import to_srgb
 from snowsplat.data.photos.decode import ImageSource, load_image, load_mask
 from snowsplat.data.photos.decode import read_header as read_image_header

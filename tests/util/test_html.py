@@ -1,14 +1,19 @@
 """The parts of report pages: well-formed, escaped, self-contained."""
 
+import re
 import xml.etree.ElementTree as ET
+from collections import defaultdict
 from gettext import NullTranslations
+from pathlib import Path
 
 import pytest
 from jinja2 import UndefinedError
 from PIL import Image
 
+import snowsplat
 from snowsplat.util import html, messages
 from snowsplat.util.duration import duration
+from snowsplat.util.html import THEME, colours, with_colours
 from snowsplat.util.messages import message, plural
 
 from ..browser import Browser
@@ -146,3 +151,27 @@ def test_a_browser_shows_its_language_and_a_button_the_other_one(chinese, tmp_pa
         assert page.evaluate("document.documentElement.lang") == "en"
         assert page.evaluate("document.documentElement.style.colorScheme") == "dark"
         assert not page.errors
+
+
+_SOURCE = Path(snowsplat.__file__).parent
+_SUFFIXES = {".css", ".html", ".j2", ".js", ".py"}
+
+
+def test_colours_by_name():
+    assert {"amber", "night"} <= set(colours())
+    assert "accent" not in colours()  # it depends on light and dark
+    css = "a { color: var(--amber); fill: var(--accent); }"
+    assert with_colours(css) == f"a {{ color: {colours()['amber']}; fill: var(--accent); }}"
+
+
+def test_a_colour_of_the_theme_stands_once():
+    places = defaultdict(list)
+    for file in _SOURCE.rglob("*"):
+        if file.suffix in _SUFFIXES and "_viewer" not in file.parts:
+            for colour in re.findall(r"#[0-9a-f]{6}\b", file.read_text("utf-8"), re.IGNORECASE):
+                places[colour.lower()].append(file.name)
+    named = re.findall(r"#[0-9a-f]{6}\b", THEME.read_text("utf-8"))
+    assert {"#ffb454", "#a35808"} <= set(named)
+    assert {colour: places[colour] for colour in named} == {
+        colour: [THEME.name] for colour in named
+    }

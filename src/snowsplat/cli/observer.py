@@ -20,8 +20,8 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.stage_lines import described
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
+from snowsplat.util.machine import resident_bytes
 from snowsplat.util.messages import Message, message
-from snowsplat.util.process_memory import resident_bytes
 
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from snowsplat.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from snowsplat.data.dataset import Dataset, Points, View, scene_extent
+    from snowsplat.data.dataset import Dataset, Points, View
+    from snowsplat.data.frame.bounds import scene_extent
     from snowsplat.data.load import (
         DatasetFiles,
         load_dataset,
@@ -47,6 +48,6 @@ _MODULES = {
     "read_dataset": "load",
     "read_files": "load",
     "read_undamaged": "load",
-    "scene_extent": "dataset",
+    "scene_extent": "frame.bounds",
 }
 __getattr__, __dir__ = lazy_names(__name__, _MODULES)

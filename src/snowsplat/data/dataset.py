@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from snowsplat.data.frame.bounds import EXTENT_FACTOR, scene_bounds
+from snowsplat.data.frame.bounds import scene_bounds
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.camera import Camera
@@ -192,14 +191,3 @@ def safe_name(path: str) -> str:
     """A valid `View.name` from the path of an image as written in a dataset file."""
     parts = path.replace("\\", "/").split("/")
     return "/".join(part for part in parts if part not in ("", ".", "..") and ":" not in part)
-
-
-def scene_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 × the largest distance of a camera centre from the mean centre, in world units.
-
-    This is the paper's scene extent. It scales the learning rate of positions and must not be 0,
-    so it is 1 if all cameras have the same centre.
-    """
-    centres = torch.stack([camera.position.detach() for camera in cameras])
-    radius = float((centres - centres.mean(0)).norm(dim=1).max())
-    return EXTENT_FACTOR * radius if radius > 0.0 else 1.0

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import torch
 
-from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
+from snowsplat.data.dataset import Dataset, Points, PosedImage, View
 from snowsplat.data.files.listing import folders_of_maps
 from snowsplat.data.files.masks import with_masks
 from snowsplat.data.files.photo_files import warn_of_unusable
+from snowsplat.data.frame.bounds import near_of, scene_extent
 from snowsplat.data.frame.move_to_origin import move_to_origin
-from snowsplat.data.frame.near import near_of
 from snowsplat.data.hold_out import held_out_names
 from snowsplat.data.image_sizes import ImageSize, with_sizes, with_smaller_copies
 from snowsplat.data.lens.coverage import image_circle

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from snowsplat.data.maps.mask_look import doubt_about_files
+from snowsplat.data.maps.mask_pixels import doubt_about_files
 from snowsplat.data.readers.projects import advice
 from snowsplat.pipeline.options.make import PRESETS
 from snowsplat.project.left_out import LeftOut

@@ -44,8 +44,8 @@ from snowsplat.training.starts.plane_sweep import Picture, depth_ranges, swept_m
 from snowsplat.training.starts.source_views import source_views
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import check_target, make_parent
+from snowsplat.util.machine import return_unused
 from snowsplat.util.process import single_threaded
-from snowsplat.util.process_memory import return_unused
 
 #: Memory: pixels of all depth maps, with 5 bytes each, and blocks of 512 voxels with 8 bytes each.
 _MOST_PIXELS, _MOST_BLOCKS = 120_000_000, 100_000

@@ -43,8 +43,8 @@ from snowsplat.training.settings.stored import config_from_json, config_to_json
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
+from snowsplat.util.machine import reset_peak, resident_bytes
 from snowsplat.util.messages import Message, message
-from snowsplat.util.process_memory import reset_peak, resident_bytes
 from snowsplat.util.run_lock import one_run
 
 logger = logging.getLogger(__name__)

@@ -18,8 +18,8 @@ from snowsplat.studio.picture_requests import SUFFIXES
 from snowsplat.studio.requests import File, Studio, json_object
 from snowsplat.studio.scene_requests import summary
 from snowsplat.util.errors import UserError, cause_of
+from snowsplat.util.html import THEME
 from snowsplat.util.safe_json import printable
-from snowsplat.util.theme import THEME
 from snowsplat.viewer.http.guard import LOOK
 
 _PAGES = Path(__file__).parent / "pages"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,22 @@ from PIL import Image
 from snowsplat.util.duration import duration
 from snowsplat.util.messages import LANGUAGES, Message, as_message, message, plural
 from snowsplat.util.safe_json import printable
+
+#: The style sheet, which pages include.
+THEME = Path(__file__).with_name("theme.css")
+
+
+@cache
+def colours() -> dict[str, str]:
+    """The colours that are the same in light and dark, by name."""
+    return dict(re.findall(r"--(\w+): (#[0-9a-f]+);", THEME.read_text(encoding="utf-8")))
+
+
+def with_colours(css: str) -> str:
+    """A style sheet in which ``var(--name)`` of `colours` is replaced by the colour, for pages
+    without `THEME`."""
+    return re.sub(r"var\(--(\w+)\)", lambda found: colours().get(found[1], found[0]), css)
+
 
 if TYPE_CHECKING:
     import jinja2

@@ -23,8 +23,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.machine import resident_bytes
 from snowsplat.util.messages import Message
-from snowsplat.util.process_memory import resident_bytes
 
 _SECONDS = 10.0  # processor time to start Python and the library
 _BYTES_PER_SECOND = 1_000_000  # a low estimate of the reading speed

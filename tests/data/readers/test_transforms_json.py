@@ -103,9 +103,9 @@ def test_cameras_that_cannot_be_used(scene, common, message):
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
-        ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], "4 rows of 4"),
-        ("none", "4 rows of 4"),
-        ([[float("inf")] * 4] * 4, "4 rows of 4"),
+        ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], "transform_matrix: should be 12 numbers"),
+        ("none", "transform_matrix: should be 16 numbers"),
+        ([[float("inf")] * 4] * 4, "transform_matrix: should be 16 numbers"),
         ([[0, 0, 0, 1]] * 4, "not a rotation"),
         ([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "not a rotation"),
         ([[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "mirrors"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.data.frame.near import near_of
+from snowsplat.data.frame.bounds import near_of
 from snowsplat.data.frame.placement import PLACEMENT, Placement, placement_of, read_placement
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat

@@ -1,12 +1,66 @@
-"""An axis-aligned box around a scene, from its points or, without points, from its cameras."""
+"""An axis-aligned box around a scene, from its points or, without points, from its cameras; and
+the near plane of the cameras."""
 
+from __future__ import annotations
+
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera import Camera, near_plane
+from snowsplat.util.process import single_threaded
+
+# At most this number of cameras is used, evenly chosen, to limit the time; of the points about this
+# number, and more if that is too few for most cameras: each may see a small part of a large scene.
+_CAMERAS, _POINTS, _MORE = 64, 10_000, 8
+# The nearest points of a camera are ignored, because some points are wrong; and so are the cameras
+# with the nearest points, of which some may be wrong.
+_NEAREST, _NEAREST_CAMERAS = 0.02, 0.1
+# Cameras that see fewer points are ignored.
+_FEWEST = 20
+
+
+def near_of(cameras: Sequence[Camera], points: Tensor | None) -> float:
+    """The near plane for all cameras of a scene, in world units; see `near_plane`.
+
+    It depends on the depths of the points that the cameras see. Without points, it depends on the
+    distance between the cameras and the middle of `scene_bounds`. That is a guess if the cameras
+    look in the same direction, so no more than the extent of the cameras is used.
+
+    Args:
+        cameras: at least one.
+        points: (P, 3) in the world frame, or None.
+    """
+    used = cameras[:: math.ceil(len(cameras) / _CAMERAS)]
+    depths = []
+    if points is not None:
+        step = max(1, len(points) // _POINTS)
+        while len(depths := _depths(used, points[::step])) < len(used) / 2 and step > 1:
+            step = max(1, step // _MORE)
+    if depths:
+        nearest, medians = np.array(depths).T
+        return near_plane(float(np.median(medians)), float(np.quantile(nearest, _NEAREST_CAMERAS)))
+    middle = scene_bounds(used).double().mean(0)
+    away = [float((camera.position.detach() - middle).norm()) for camera in used]
+    return near_plane(min(float(np.median(away)), scene_extent(used)))
+
+
+@single_threaded()  # for so few points, threads take longer to start than to compute
+def _depths(cameras: Sequence[Camera], points: Tensor) -> list[tuple[float, float]]:
+    """For each camera that sees enough points: their 2% quantile and their median depth."""
+    points = points.detach().cpu().double()
+    levels = torch.tensor([_NEAREST, 0.5], dtype=torch.float64)
+    found = []
+    for camera in cameras:
+        seen = camera.depths_in_view(points)
+        if len(seen) >= _FEWEST:
+            nearest, median = torch.quantile(seen, levels).tolist()
+            found.append((nearest, median))
+    return found
+
 
 # Half the side of the cube, relative to half the visible width of the median camera at the
 # distance of the cube's centre. With this value the cube of the synthetic Blender scenes is ±1.3,
@@ -77,3 +131,14 @@ def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Ten
 
 def _cube(centre: Tensor, half: float) -> Tensor:
     return torch.stack([centre - half, centre + half]).to(torch.float32)
+
+
+def scene_extent(cameras: Sequence[Camera]) -> float:
+    """1.1 × the largest distance of a camera centre from the mean centre, in world units.
+
+    This is the paper's scene extent. It scales the learning rate of positions and must not be 0,
+    so it is 1 if all cameras have the same centre.
+    """
+    centres = torch.stack([camera.position.detach() for camera in cameras])
+    radius = float((centres - centres.mean(0)).norm(dim=1).max())
+    return EXTENT_FACTOR * radius if radius > 0.0 else 1.0

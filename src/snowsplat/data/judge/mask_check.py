@@ -10,7 +10,7 @@ import numpy as np
 from snowsplat.data.dataset import Points, View
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.rig import Rig
-from snowsplat.data.maps.mask_look import INVERT, doubt_about_masks, look_of
+from snowsplat.data.maps.mask_pixels import INVERT, doubt_about_masks, look_of
 from snowsplat.data.photos.decode import ImageSource, load_mask
 from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import each_photo

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
 from snowsplat.data.lens.lens import Lens
-from snowsplat.data.lens.positions import Positions
 from snowsplat.data.lens.views import LensView
 
 _SAMPLES = 2  # of a pixel along each axis
+_KEPT = 8  # views at a size, whose covered pixels are kept
 # Of 255: outside of the circle no photo is brighter, except for JPEG artefacts and noise.
 _BLACK = 24
 # Share of the pixels outside of the circle that must be black.
@@ -52,43 +53,17 @@ def image_circle(lens: Lens, photos: Sequence[np.ndarray]) -> float | None:
     return float(rings[0] / _RINGS * farthest) * (1 - _RIM)
 
 
+@lru_cache(_KEPT)
 def covered_pixels(view: LensView | None, width: int, height: int) -> np.ndarray:
     """(height, width) bool: the pixels of a view at this size that lie completely in the photo.
 
-    None: a photo without distortion, all of whose pixels are shown.
+    None: a photo without distortion, all of whose pixels are shown. The array is not to be changed.
     """
     made: np.ndarray = np.ones((height, width), bool)
-    if view is None or not view.partial:
-        return made
-    for rows, positions in view.positions(_SAMPLES * width, _SAMPLES * height):
-        part = made[rows.start // _SAMPLES : rows.stop // _SAMPLES]
-        # The photo and its circle are convex. Only cells at their border need a test of each pixel.
-        inside, outside = _sides(view, positions.nodes)
-        part[...] = _every(inside, positions)
-        y, x = np.nonzero(_every(~outside, positions) & ~part)
-        sample = np.arange(_SAMPLES)
-        x, y = (_SAMPLES * at[:, None, None] + sample for at in (x, y))
-        at = positions.at(x, y.transpose(0, 2, 1))
-        part[y[:, 0, 0] // _SAMPLES, x[:, 0, 0] // _SAMPLES] = view.covered(at).all((1, 2))
+    if view is not None and view.partial:
+        samples = np.ones((_SAMPLES * height, _SAMPLES * width), bool)
+        for rows, positions in view.strips(_SAMPLES * width, _SAMPLES * height):
+            samples[rows] = view.covered(positions)
+        made = samples.reshape(height, _SAMPLES, width, _SAMPLES).all((1, 3))
+    made.flags.writeable = False
     return made
-
-
-def _sides(view: LensView, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cells that lie completely inside of the photo and its circle, and those outside."""
-    corners = np.stack([nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]])
-    low, high = corners.min(0), corners.max(0)  # NaN if a corner is
-    inside = np.logical_and.reduce([view.covered(corner) for corner in corners])
-    size = view.lens.width, view.lens.height
-    outside = ~((high >= 0) & (low <= size)).all(-1)
-    if view.circle is not None:
-        centre = np.array(view.lens.intrinsics[2:])
-        outside |= np.linalg.norm(centre.clip(low, high) - centre, axis=-1) > view.circle
-    return inside, outside
-
-
-def _every(cells: np.ndarray, positions: Positions) -> np.ndarray:
-    """The pixels all of whose samples are in ``cells`` (n − 1, m − 1) bool."""
-    for axis, nodes in enumerate((positions.row, positions.column)):
-        samples = nodes.reshape(-1, _SAMPLES).T
-        cells = np.logical_and.reduce([cells.take(sample, axis) for sample in samples])
-    return cells

@@ -277,7 +277,7 @@ def _decode_mask(source: ImageSource) -> np.ndarray:
 
 def _mask_of(levels: np.ndarray | None, source: ImageSource) -> Tensor:
     """`load_mask` from levels as stored. None: the mask is white."""
-    covered = torch.from_numpy(covered_pixels(source.view, source.width, source.height))
+    covered = torch.tensor(covered_pixels(source.view, source.width, source.height))
     if levels is None:
         return covered
     scaled = _resize_view(levels[None], source.view, source.width, source.height)[0]

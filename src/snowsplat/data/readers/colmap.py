@@ -7,17 +7,23 @@ No conversion is needed.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
-from snowsplat.data.colmap.model import count_images, posed_camera, read_model
+from snowsplat.data.colmap.model import (
+    count_images,
+    posed_camera,
+    read_model,
+    read_observations,
+    read_point_file,
+)
 from snowsplat.data.colmap.places import find_models, find_models_below, workspace_of
-from snowsplat.data.colmap.tracks import points_with_tracks
-from snowsplat.data.colmap.types import ColmapModel
-from snowsplat.data.dataset import PosedImage, safe_name
+from snowsplat.data.colmap.types import ColmapModel, PointFile
+from snowsplat.data.dataset import Points, PosedImage, Tracks, safe_name, usable_points
 from snowsplat.data.files.photo_files import (
     find_photos,
     photos_below,
@@ -32,6 +38,58 @@ from snowsplat.scene.length import stored_metres
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import inside, is_file, quoted
+
+# Images whose observations are read, spread over the model.
+_MOST_IMAGES = 100
+# Share of the observations of tracks that must name the point of their track. If it is less, the
+# points or the images were replaced.
+_LEAST_VALID = 0.5
+
+
+def points_with_tracks(model: ColmapModel, names: Mapping[int, str]) -> Points | None:
+    """The points of a model, with `Points.tracks` if its images have their observations.
+
+    Args:
+        model: of which the points are read.
+        names: of views, by the ids of the images that are used.
+
+    Raises: UserError: a file is damaged.
+    """
+    if (found := read_point_file(model.folder)) is None:
+        return None
+    path, file = found
+    points = usable_points(path, file.xyz, file.rgb)
+    if points is None or len(points) < len(file.xyz):  # those left out would have other rows
+        return points
+    return replace(points, tracks=_tracks(model, names, file))
+
+
+def _tracks(model: ColmapModel, names: Mapping[int, str], file: PointFile) -> Tracks | None:
+    seen = file.tracks[np.isin(file.tracks[:, 1], list(names))]
+    images = np.unique(seen[:, 1])
+    images = images[:: -(-len(images) // _MOST_IMAGES) or 1]
+    seen = seen[np.isin(seen[:, 1], images)]
+    if not len(seen):
+        return None
+    rows = {int(image): seen[seen[:, 1] == image] for image in images}
+    observed = read_observations(model, {image: track[:, 2] for image, track in rows.items()})
+    used = (image for image in model.images if image.number in names)
+    cameras = {image.number: model.cameras[image.camera_id] for image in used}
+    rays, points, photos, valid = [], [], [], 0
+    for number, (image, track) in enumerate(rows.items()):
+        found = observed[image]
+        known = found[:, 2] == file.ids[track[:, 0]]
+        valid += int(known.sum())
+        ray = cameras[image].unproject(found[known, :2])
+        rays.append(ray)
+        points.append(track[known, 0])
+        photos.append(np.full(len(ray), number))
+    if valid < _LEAST_VALID * len(seen):
+        return None
+    ray, point, photo = np.concatenate(rays), np.concatenate(points), np.concatenate(photos)
+    usable = np.isfinite(ray).all(1)
+    return Tracks([names[image] for image in rows], photo[usable], point[usable], ray[usable])
+
 
 logger = logging.getLogger(__name__)
 

@@ -35,7 +35,7 @@ def perspective(
 
     Raises: UserError: the size or a focal length is not valid.
     """
-    size = _valid_size(where, width, height, intrinsics)
+    size = valid_size(where, width, height, intrinsics)
     k1, k2, k3, k4 = [*radial, 0.0, 0.0, 0.0, 0.0][:4]
     p1, p2 = tangential
     if not any((k1, k2, k3, k4, p1, p2, skew)):
@@ -57,7 +57,7 @@ def fisheye(
     tangential: Sequence[float] = (0.0, 0.0),
 ) -> Lens:
     """An equidistant lens: θ (1 + k₁ θ² + k₂ θ⁴ + k₃ θ⁶ + k₄ θ⁸); arguments of `perspective`."""
-    size = _valid_size(where, width, height, intrinsics)
+    size = valid_size(where, width, height, intrinsics)
     k1, k2, k3, k4 = [*radial, 0.0, 0.0, 0.0, 0.0][:4]
     p1, p2 = tangential
     if p1 or p2:
@@ -77,9 +77,10 @@ def centred_intrinsics(width: float, height: float, focal: float) -> Intrinsics:
     return focal, focal, width / 2, height / 2
 
 
-def _valid_size(
+def valid_size(
     where: object, width: float, height: float, intrinsics: Intrinsics
 ) -> tuple[int, int]:
+    """Width and height in pixels. Raises `UserError` if these or a focal length are not valid."""
     size = parse.size_of(where, width, height)
     fx, fy, _, _ = intrinsics
     if not (0 < fx < 1e9 and 0 < fy < 1e9):

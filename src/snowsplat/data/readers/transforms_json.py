@@ -33,11 +33,11 @@ from snowsplat.data.colmap.model import read_points
 from snowsplat.data.colmap.places import find_models
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.files.photo_files import find_photos, warn_of_missing, warn_of_unusable
-from snowsplat.data.photos.decode import IMAGE_SUFFIXES, read_header
+from snowsplat.data.photos.decode import IMAGE_SUFFIXES
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.data.readers import parse
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reader, Reconstruction
-from snowsplat.data.readers.transforms_lens import is_panorama, lens_of, number_of
+from snowsplat.data.readers.transforms_lens import lens_of, stated
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.util.errors import UserError
@@ -96,7 +96,7 @@ def read(files: list[Path], photos: PhotoFolder) -> Reconstruction:
         values = {key: value for key, value in frame.values.maps[0].items() if key != "file_path"}
         with result.one(frame.name or frame.where):
             if not frame.name:
-                raise UserError("{where}: no file_path; export the file again", where=frame.where)
+                raise parse.damaged(frame.where, "no file_path")
             if file is None or seen.get((file, frame.split)) == values:  # or the same again
                 continue
             if (file, frame.split) in seen:
@@ -193,16 +193,15 @@ def _without_overlap(
 def _posed_image(
     where: str, root: Path, file: str, values: ChainMap[str, Any], split: _Split | None
 ) -> PosedImage:
-    """The image ``root / file`` of a frame; ``values`` as in `_camera`."""
-    camera = _camera(where, values, root / file)
-    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-    lens = lens_of(where, values, camera.width, camera.height, intrinsics)
+    """The image ``root / file`` of a frame; ``values`` as in `lens_of`."""
+    lens = lens_of(where, values, root / file)
+    camera = Camera(lens.width, lens.height, *lens.intrinsics, _pose(where, values))
     return replace(
         PosedImage.below(root, file, camera, lens),
         mask=_mask(where, root, values.maps[0]),  # masks belong to frames, not to files
         split=split,
         depth=_depth_map(root, values.maps[0]),
-        depth_unit=number_of(where, values, "integer_depth_scale") or 1.0,
+        depth_unit=stated(where, values, "integer_depth_scale") or 1.0,
     )
 
 
@@ -293,73 +292,6 @@ def _depth_map(root: Path, frame: Mapping[str, Any]) -> Path | None:
     return None
 
 
-def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
-    """The camera of a frame, without the distortion of its lens.
-
-    Args:
-        where: the start of error messages.
-        values: the entries of the frame and, for those that it does not have, of the file.
-        image: the image file, which provides the size if ``values`` has none.
-    """
-    width, height = number_of(where, values, "w"), number_of(where, values, "h")
-    if width is None or height is None:
-        header = read_header(image)
-        width, height = header.width, header.height
-    if width < 1 or height < 1:
-        raise UserError(
-            "{where}: the image size {width:g}x{height:g} is not valid; correct it",
-            where=where,
-            width=width,
-            height=height,
-        )
-    width, height = round(width), round(height)
-    fx, fy = _focal(where, values, "x", width), _focal(where, values, "y", height)
-    # Pixels are square if there is only one focal length.
-    fx, fy = fy if fx is None else fx, fx if fy is None else fy
-    if is_panorama(values):
-        fx = fy = width / (2 * math.pi)  # pixels per radian at the centre
-    if fx is None or fy is None:
-        raise UserError(
-            "{where}: no focal length (fl_x or camera_angle_x); export it again", where=where
-        )
-    if fx <= 0 or fy <= 0:
-        raise UserError(
-            "{where}: the focal lengths {fx:g} and {fy:g} pixels are not valid; correct them",
-            where=where,
-            fx=fx,
-            fy=fy,
-        )
-    cx, cy = number_of(where, values, "cx"), number_of(where, values, "cy")
-    return Camera(
-        width,
-        height,
-        fx,
-        fy,
-        width / 2 if cx is None else cx,
-        height / 2 if cy is None else cy,
-        _pose(where, values),
-    )
-
-
-def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float | None:
-    """Focal length in pixels along an axis ("x" or "y"), or None. It is read from ``fl_x``,
-    ``camera_angle_x`` (radians) or ``x_fov`` (degrees)."""
-    pixels = number_of(where, values, f"fl_{axis}")
-    angle = number_of(where, values, f"camera_angle_{axis}")
-    degrees = number_of(where, values, f"{axis}_fov")
-    if angle is None and degrees is not None:
-        angle = math.radians(degrees)
-    if angle is None or (pixels is not None and not 0 < angle < math.pi):
-        return pixels
-    if not 0 < angle < math.pi:
-        raise UserError(
-            "{where}: the field of view {degrees:g}° is not valid; correct it",
-            where=where,
-            degrees=math.degrees(angle),
-        )
-    return 0.5 * size / math.tan(0.5 * angle) if pixels is None else pixels
-
-
 def _warn_of_contradictions(path: Path, scene: _Json) -> None:
     """Warn if ``fl_x`` and ``camera_angle_x`` of the file are of different lenses."""
     for axis, side in (("x", "w"), ("y", "h")):
@@ -387,20 +319,12 @@ def _warn_of_contradictions(path: Path, scene: _Json) -> None:
 
 def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:
     """cam_from_world (3, 4) float64, OpenCV axes, from the transform_matrix of a frame."""
-    try:
-        matrix = np.array(frame["transform_matrix"], np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        matrix = np.empty(0)
-    if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < 1e15).all():
-        raise UserError(
-            "{where}: transform_matrix must be 4 rows of 4 numbers; export it again", where=where
-        )
-    if matrix.shape == (4, 4) and matrix[3, :3].any() and not matrix[:3, 3].any():
-        raise UserError(
-            "{where}: transform_matrix is transposed: its last row must be 0 0 0 1, and its last "
-            "column the position; export it again",
-            where=where,
-        )
+    value = frame.get("transform_matrix")
+    rows = 3 if isinstance(value, list) and len(value) == 3 else 4
+    matrix = parse.numbers(f"{where}: transform_matrix", value, rows, 4)
+    if rows == 4 and matrix[3, :3].any() and not matrix[:3, 3].any():
+        problem = "transform_matrix is transposed: its last row must be 0 0 0 1, and its last "
+        raise parse.damaged(where, f"{problem}column the position")
     axes = matrix[:3, :3]
     # A scaled camera object in Blender has a scaled matrix; only the directions are used. The
     # nearest rotation corrects rounding errors of exporters. Larger differences are an error.
@@ -408,9 +332,9 @@ def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:
     u, _, vt = np.linalg.svd(axes / scale if scale > 1e-9 else np.zeros((3, 3)))
     rotation = u @ vt
     if scale <= 1e-9 or np.abs(rotation * scale - axes).max() > 1e-2 * scale:
-        raise UserError("{where}: transform_matrix is not a rotation; export it again", where=where)
+        raise parse.damaged(where, "transform_matrix is not a rotation")
     if np.linalg.det(rotation) < 0:
-        raise UserError("{where}: transform_matrix mirrors the world; export it again", where=where)
+        raise parse.damaged(where, "transform_matrix mirrors the world")
     world_from_cam = np.concatenate([rotation @ _FLIP, matrix[:3, 3:]], axis=1)
     return invert_rigid(torch.from_numpy(world_from_cam))
 

@@ -7,48 +7,59 @@ other lenses is that of the eighth power of the radius, where OpenCV has a ratio
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from snowsplat.data.lens import models
 from snowsplat.data.lens.lens import Lens
-from snowsplat.data.readers.lenses import Intrinsics, equirectangular, fisheye, perspective
+from snowsplat.data.photos.decode import read_header
+from snowsplat.data.readers import parse
+from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective, valid_size
 from snowsplat.util.errors import UserError
-from snowsplat.util.safe_json import quoted
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 #: The models that are read, by their names here.
 _MODELS = {name: model for model in models.MODELS.values() for name in model.in_transforms}
+_PANORAMA = ("equirectangular", "is_equirectangular", "latlong")
 
 
-def is_panorama(values: Mapping[str, Any]) -> bool:
-    """Whether a frame is an equirectangular panorama, which needs no focal length."""
-    flags = ("equirectangular", "is_equirectangular", "latlong")
-    return _model(values) == "EQUIRECTANGULAR" or any(values.get(flag) for flag in flags)
-
-
-def lens_of(
-    where: str, values: Mapping[str, Any], width: int, height: int, intrinsics: Intrinsics
-) -> Lens:
+def lens_of(where: str, values: Mapping[str, Any], image: Path) -> Lens:
     """The lens of a frame.
 
     Args:
         where: the start of error messages.
         values: the entries of the frame and, for those that it does not have, of the file.
-        width, height: of the photo that the intrinsics are for.
-        intrinsics: fx, fy, cx, cy in pixels.
+        image: the image file, which provides the size if ``values`` has none.
 
-    Raises: UserError: the model is not known, or a coefficient is not a number.
+    Raises: UserError: the model or the focal length is not known, or a value is not plausible.
     """
-    if is_panorama(values):
+    width, height = stated(where, values, "w"), stated(where, values, "h")
+    if width is None or height is None:
+        header = read_header(image)
+        width, height = header.width, header.height
+    width, height = round(width), round(height)
+    model = str(values.get("camera_model") or "OPENCV").upper()
+    if model == "EQUIRECTANGULAR" or any(values.get(flag) for flag in _PANORAMA):
         return equirectangular(where, width, height)
-    model = _model(values)
+    fx, fy = _focal(where, values, "x", width), _focal(where, values, "y", height)
+    # Pixels are square if there is only one focal length.
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
+        raise parse.damaged(where, "no focal length (fl_x or camera_angle_x)")
+    cx, cy = stated(where, values, "cx"), stated(where, values, "cy")
+    intrinsics = fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    valid_size(where, width, height, intrinsics)
     if any(key.startswith("ftheta_p") for key in values):
         model = "F-Theta"
     kind = _MODELS.get(model)
     if kind is not None and kind.equation is models.aria_fisheye:
-        numbers = _distortion_params(where, values, len(kind.parameters) - len(intrinsics))
-        return Lens(kind, width, height, (*intrinsics, *numbers))
+        count = len(kind.parameters) - len(intrinsics)
+        numbers = parse.numbers(
+            f"{where}: distortion_params", values.get("distortion_params"), count
+        )
+        return Lens(kind, width, height, (*intrinsics, *numbers.tolist()))
     if kind is None:
         raise UserError(
             "{where}: the camera model {model} is not known; undistort the photos with the "
@@ -56,51 +67,38 @@ def lens_of(
             where=where,
             model=model[:40],
         )
-    if isinstance(values.get("distortion_params"), list):
-        k1, k2, k3, k4, p1, p2 = _distortion_params(where, values, 6)
+    listed = values.get("distortion_params")
+    if isinstance(listed, list):
+        k1, k2, k3, k4, p1, p2 = parse.numbers(f"{where}: distortion_params", listed, 6).tolist()
         k5 = k6 = 0.0
     else:
         k1, k2, k3, k4, k5, k6, p1, p2 = (
-            number_of(where, values, key) or 0.0 for key in _COEFFICIENTS
+            stated(where, values, key) or 0.0 for key in _COEFFICIENTS
         )
     radial = (k1, k2, k3, k4)
     if kind.angular or values.get("is_fisheye") or values.get("fisheye"):
         return fisheye(where, width, height, intrinsics, radial, (p1, p2))
     if k5 or k6 or (k4 and kind.name == "FULL_OPENCV"):
-        numbers = (k1, k2, p1, p2, k3, k4, k5, k6)
-        return models.lens_of("FULL_OPENCV", width, height, (*intrinsics, *numbers))
+        params = (*intrinsics, k1, k2, p1, p2, k3, k4, k5, k6)
+        return models.lens_of("FULL_OPENCV", width, height, params)
     return perspective(where, width, height, intrinsics, radial, (p1, p2))
 
 
-def _model(values: Mapping[str, Any]) -> str:
-    return str(values.get("camera_model") or "OPENCV").upper()
+def stated(where: str, values: Mapping[str, Any], key: str) -> float | None:
+    """The number ``values[key]``; None: none is stated. Raises UserError: not a number."""
+    return None if values.get(key) is None else parse.number(where, values, key)
 
 
-def number_of(where: str, values: Mapping[str, Any], key: str) -> float | None:
-    """None: no number is stated. Raises UserError if the value is not a number or is damaged."""
-    value = values.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
-        raise UserError(
-            "{where}: {name} should be a number, not {value}; correct it",
-            where=where,
-            name=key,
-            value=quoted(value),
-        )
-    return float(value)
-
-
-def _distortion_params(where: str, values: Mapping[str, Any], count: int) -> tuple[float, ...]:
-    listed = values.get("distortion_params")
-    numbers = [*listed] if isinstance(listed, list) else []
-    if len(numbers) != count:
-        raise UserError(
-            "{where}: distortion_params should be {count} numbers for the camera model {model}; "
-            "export the file again",
-            where=where,
-            count=count,
-            model=_model(values)[:40],
-        )
-    key = "distortion_params"
-    return tuple(number_of(where, {key: value}, key) or 0.0 for value in numbers)
+def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float | None:
+    """Focal length in pixels along an axis ("x" or "y"), or None. It is read from ``fl_x``,
+    ``camera_angle_x`` (radians) or ``x_fov`` (degrees)."""
+    pixels, angle, degrees = (
+        stated(where, values, key) for key in (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov")
+    )
+    if angle is None and degrees is not None:
+        angle = math.radians(degrees)
+    if angle is None or pixels is not None:
+        return pixels
+    if not 0 < angle < math.pi:
+        raise parse.damaged(where, f"the field of view {math.degrees(angle):g}° is not valid")
+    return 0.5 * size / math.tan(0.5 * angle)

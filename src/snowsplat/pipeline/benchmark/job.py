@@ -33,8 +33,7 @@ from snowsplat.training.core.history import History
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.interrupts import ended_by_signals, ended_together
-from snowsplat.util.machine import processor_name
-from snowsplat.util.process_memory import peak_bytes
+from snowsplat.util.machine import peak_bytes, processor_name
 from snowsplat.util.run_lock import InUse, locked
 from snowsplat.util.safe_json import from_json, read_json
 

@@ -49,9 +49,9 @@ from snowsplat.training.settings.stored import config_to_json
 from snowsplat.training.step.finite import Diverged
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
+from snowsplat.util.machine import peak_bytes
 from snowsplat.util.messages import Message, message
 from snowsplat.util.process import single_threaded
-from snowsplat.util.process_memory import peak_bytes
 
 logger = logging.getLogger(__name__)
 

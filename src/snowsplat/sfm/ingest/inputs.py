@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
-from snowsplat.data.maps.mask_look import doubt_about_masks
+from snowsplat.data.maps.mask_pixels import doubt_about_masks
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.ingest.content.panorama import STITCHED, is_twice_as_wide, spherical_video

@@ -13,9 +13,8 @@ from functools import partial
 import numpy as np
 from markupsafe import Markup
 
-from snowsplat.util.html import render_page, svg_text
+from snowsplat.util.html import colours, render_page, svg_text
 from snowsplat.util.messages import Message, message
-from snowsplat.util.theme import colours
 
 _WIDTH = 520  # of the largest drawing, in SVG units
 _HEIGHT = 400

@@ -17,8 +17,8 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.names import changed
 from snowsplat.util.byte_size import format_bytes, parse_bytes
 from snowsplat.util.errors import SettingError
+from snowsplat.util.machine import peak_bytes
 from snowsplat.util.messages import Message, message
-from snowsplat.util.process_memory import peak_bytes
 
 #: Bytes per pixel of a decoded photo, and of its mask.
 _RGB = 3

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.data.dataset import scene_extent
+from snowsplat.data.frame.bounds import scene_extent
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project, render

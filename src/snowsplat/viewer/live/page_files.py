@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from snowsplat.util.theme import THEME
+from snowsplat.util.html import THEME
 
 _PAGE = Path(__file__).parent / "page"
 INDEX = "index.html"

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.html import with_colours
 from snowsplat.util.safe_json import parse_json
-from snowsplat.util.theme import with_colours
 
 _FOLDER = Path(__file__).parents[2] / "_viewer"  # of the package
 _PANEL = Path(__file__).parent

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snowsplat.sfm.colmap.features.patches import SIDE, align_patches, cut_patches, patch_axes
+from snowsplat.sfm.colmap.features.alignment import SIDE, align_patches, cut_patches, patch_axes
 from snowsplat.util import native_library
 from snowsplat.util.native_layout import ALIGNMENT_RADIUS
 

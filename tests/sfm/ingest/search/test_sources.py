@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.search.names import free_name
+from snowsplat.sfm.ingest.photo import free_name
 from snowsplat.sfm.ingest.search.sources import find_sources, kind_of_file
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.maps.mask_look import MaskLook, look_of
+from snowsplat.data.maps.mask_pixels import MaskLook, look_of
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.ingest.content.panorama import (
@@ -23,7 +23,7 @@ from snowsplat.sfm.ingest.content.panorama import (
     shows_all_around,
 )
 from snowsplat.sfm.ingest.content.sharpness import CONTENT_SIDE, grey_copy, why_unusable
-from snowsplat.sfm.ingest.photo import Photo, not_used
+from snowsplat.sfm.ingest.photo import Photo, free_name, not_used
 from snowsplat.sfm.ingest.photos.mask_files import read_mask, write_mask
 from snowsplat.sfm.ingest.photos.photo_files import (
     Header,
@@ -34,7 +34,6 @@ from snowsplat.sfm.ingest.photos.photo_files import (
     read_header,
     save,
 )
-from snowsplat.sfm.ingest.search.names import free_name
 from snowsplat.sfm.ingest.search.sources import Source
 from snowsplat.sfm.options import GatherOptions
 from snowsplat.sfm.progress import Report, in_threads

@@ -8,9 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from snowsplat.project.left_out import LeftOut
-from snowsplat.sfm.ingest.photo import not_used
+from snowsplat.sfm.ingest.photo import folded_stem, not_used
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, read_header
-from snowsplat.sfm.ingest.search.names import folded_stem
 from snowsplat.sfm.ingest.video.clip import film_size, why_no_video
 from snowsplat.sfm.options import MIN_PHOTOS
 from snowsplat.util.messages import Message, message

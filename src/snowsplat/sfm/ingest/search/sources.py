@@ -16,11 +16,10 @@ from snowsplat.data.readers import photo_folder, poses_in
 from snowsplat.data.readers.projects import advice
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import is_output
-from snowsplat.sfm.ingest.photo import not_used
+from snowsplat.sfm.ingest.photo import folded_stem, free_name, not_used
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, open_image
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.search.copies import find_copies
-from snowsplat.sfm.ingest.search.names import folded_stem, free_name
 from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films
 from snowsplat.sfm.ingest.video.clip import ONLY_SOUND, why_no_video
 from snowsplat.util.errors import UserError, cause_of

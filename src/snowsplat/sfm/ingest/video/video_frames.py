@@ -22,6 +22,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.photos.image_file import scaled_size
+from snowsplat.data.photos.tone_mapping import HLG, PQ, map_tones
 from snowsplat.sfm.ingest.content.fixed_parts import (
     ENOUGH_PHOTOS,
     Crop,
@@ -48,10 +49,35 @@ from snowsplat.sfm.ingest.video.clip import (
 from snowsplat.sfm.ingest.video.interlace import field_order, whole_frames
 from snowsplat.sfm.ingest.video.key_frames import Candidate, choose
 from snowsplat.sfm.ingest.video.motion import FrameMotion, has_moved
-from snowsplat.sfm.ingest.video.tone import rgb_image
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import shown
 from snowsplat.util.messages import Message, message
+
+if TYPE_CHECKING:
+    from av import VideoFrame
+
+# Matrix coefficients: code points of ITU-T H.273.
+_BT709 = 1
+_UNSPECIFIED = 2
+_BT2020 = 9
+# Rows of a frame from which on video players assume the matrix of BT.709, if none is declared.
+_HD = 720
+
+
+def rgb_image(frame: VideoFrame) -> np.ndarray:
+    """(H, W, 3) uint8 sRGB of a decoded frame, in the stored orientation."""
+    matrix = None  # None: the matrix that the frame declares
+    if frame.colorspace == _UNSPECIFIED and frame.height >= _HD:
+        matrix = _BT709
+    transfer = frame.color_trc
+    if transfer not in (PQ, HLG):
+        return frame.reformat(format="rgb24", src_colorspace=matrix).to_ndarray()
+    if frame.colorspace == _UNSPECIFIED:
+        matrix = _BT2020
+    rgb48 = frame.reformat(format="rgb48le", src_colorspace=matrix)
+    deep = rgb48.to_ndarray().astype(np.uint16, copy=False)
+    return map_tones(deep, transfer)
+
 
 if TYPE_CHECKING:
     from av import VideoFrame
