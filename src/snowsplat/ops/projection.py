@@ -22,7 +22,6 @@ from snowsplat.ops.gaussian_parameters import (
 )
 from snowsplat.ops.native import Struct, launch, query_size
 from snowsplat.ops.splats import SplatGradient, Splats2D, packed_width
-from snowsplat.ops.sums import sum_of_rows
 from snowsplat.util.native_layout import POSE_SUMS
 
 
@@ -195,3 +194,14 @@ def pose_gradient(sums: Tensor | None, cam_from_world: Tensor) -> Tensor | None:
     d_rotation = d_rotation - torch.outer(translation, d_centre)
     d_translation = d_translation - rotation @ d_centre
     return torch.cat([d_rotation, d_translation[:, None]], dim=1).to(cam_from_world.dtype)
+
+
+def sum_of_rows(rows: Tensor) -> Tensor:
+    """(R, C) → (C,), bit-identical for any number of threads of torch.
+
+    On the CPU, rows are added in order. On a GPU, torch's sum has a fixed order; its cumsum does
+    not.
+    """
+    if rows.is_cuda or len(rows) == 0:
+        return rows.sum(0)
+    return rows.cumsum(0)[-1]

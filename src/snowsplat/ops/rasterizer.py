@@ -14,8 +14,8 @@ from snowsplat.ops import scratch
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import Struct, launch, query_size
+from snowsplat.ops.projection import sum_of_rows
 from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
-from snowsplat.ops.sums import sum_of_rows
 from snowsplat.util.native_layout import GROUP_CHANNELS, SLOT_WIDTH, TILE
 
 
