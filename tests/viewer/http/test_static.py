@@ -250,9 +250,6 @@ def test_foreign_pages_are_rejected(server, origin):
         ["Content-Length: 5"],
         ["Transfer-Encoding: chunked"],
         ["Host: localhost", "Host: evil.example"],
-        [f"X: {'y' * 17_000}"],
-        [f"X-{i}: {'y' * 900}" for i in range(40)],
-        [f"X-{i}: y" for i in range(300)],
     ],
 )
 def test_ambiguous_requests_are_rejected(server, headers):
@@ -263,14 +260,14 @@ def test_ambiguous_requests_are_rejected(server, headers):
         server.url,
         "\r\n".join([f"GET {path} HTTP/1.1", "Host: localhost", *headers, "", body]).encode(),
     )
-    assert clients.status(answer) in (400, 431)
+    assert clients.status(answer) == 400
     assert answer.count(b"HTTP/1.1") == 1
     assert ask(server)[0].status == 200
 
 
 def test_an_incomplete_request_times_out(monkeypatch):
     """The time limit also applies if the request arrives byte by byte."""
-    monkeypatch.setattr(guard, "_REQUEST_SECONDS", 0.5)
+    monkeypatch.setattr(guard, "IDLE_SECONDS", 0.5)
 
     def send_slowly(client: socket.socket) -> None:
         for byte in b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 100:

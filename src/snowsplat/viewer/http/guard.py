@@ -5,14 +5,13 @@ Therefore:
 
 - The Host and Origin headers of a request must be those of this server (`KnownHosts`), and its
   path must begin with a secret token; or with one that only reads a part (`Guard.look`).
-- The head of a request must be exactly as the protocol defines it. Only requests that carry data
-  (POST, PUT) have a body, of a declared size.
+- Only requests that carry data (POST, PUT) have a body, of a declared size. h11 refuses what is
+  not a request, and one that is too long.
 - The numbers of connections and of WebSockets are limited. A connection that is silent, sends a
   request slowly, or does not receive what is sent to it, is closed.
-- WebSocket messages are short, and a client that sends more of them than a page can send is
-  disconnected. No more of them are read than the app receives.
 
-`Guard` does what an ASGI app can do; the two protocols do the rest.
+`Guard` does what an ASGI app can do; the two protocols close the connections. Who has the token may
+open a WebSocket; uvicorn limits the size of messages, and reads no more than the app receives.
 """
 
 from __future__ import annotations
@@ -22,10 +21,9 @@ import base64
 import functools
 import hmac
 import logging
-import re
 from collections.abc import Mapping
 from http import HTTPStatus
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import h11
 from starlette.responses import Response
@@ -34,34 +32,21 @@ from starlette.websockets import WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from websockets.frames import CTRL_OPCODES, Frame
 
 from snowsplat.viewer.hosts import NO_TOKEN, KnownHosts
 
 # Seconds after which a connection is closed:
-IDLE_SECONDS = 60.0  # without a request, or without further data of a body
-_REQUEST_SECONDS = 10.0  # with an incomplete head
+IDLE_SECONDS = 60.0  # without a complete head of a request, or without further data of a body
 _SEND_SECONDS = 60.0  # if the client does not receive a block
 # Maximum values:
-_HEAD_SIZE = 16 << 10  # bytes of the head of a request
-_HEAD_LINES = 100
+HEAD_SIZE = 16 << 10  # bytes of the head of a request
 _BODY_SIZE = 16 << 20  # bytes of the body of a request
 # Open connections. A new connection replaces the oldest one that has not made a valid request; if
 # there is none, the new connection is closed.
 _CONNECTIONS = 256
 _WEBSOCKETS = 16
 MESSAGE_SIZE = 64 << 10  # bytes of a WebSocket message
-_RATE = 100.0  # WebSocket frames per second; a page sends 50 while its camera moves
-_BURST = 1000.0  # frames at once; they accumulate while a training step blocks the process
-_FRAMES = 16  # frames of a message; browsers send short messages in one frame
-_PIECE = 4 << 10  # bytes of frames that are processed before the limits are checked again
 
-# The request line and headers, exactly as the protocol defines them. Requests with unusual line
-# ends or characters are rejected, because another HTTP parser, such as that of a proxy, could find
-# their end at another position.
-_HEAD = re.compile(
-    rb"[!-~]+ [!-~]+ HTTP/1\.[01](\r\n[!#$%&'*+.^_`|~0-9A-Za-z-]+:[\t -~\x80-\xff]*)*\r\n\r\n"
-)
 _ALWAYS = {
     "Server": "snowsplat",
     "X-Content-Type-Options": "nosniff",
@@ -138,6 +123,8 @@ class Guard:
             return _text(HTTPStatus.MISDIRECTED_REQUEST, self.hosts.explain(host))
         if origin is not None and not self.hosts.include_page(origin, host):
             return Response(status_code=HTTPStatus.FORBIDDEN)
+        if (status := _problem_of_body(scope, headers)) is not None:
+            return Response(status_code=status, headers={"Connection": "close"})
         path: bytes = scope["raw_path"]
         given, slash, rest = path.removeprefix(b"/").partition(b"/")
         is_full = hmac.compare_digest(given, self.token.encode())
@@ -198,6 +185,16 @@ class Guard:
             transport.abort()
 
 
+def _problem_of_body(scope: Scope, headers: Mapping[bytes, str]) -> HTTPStatus | None:
+    """The status with which a request is refused because of its body."""
+    length = int(headers.get(b"content-length", "0"))  # h11 has checked that it is a number
+    has_body = scope["type"] == "http" and scope["method"] in ("POST", "PUT")
+    # Without a declared size, a body has no limit.
+    if b"transfer-encoding" in headers or (length and not has_body):
+        return HTTPStatus.BAD_REQUEST
+    return HTTPStatus.REQUEST_ENTITY_TOO_LARGE if length > _BODY_SIZE else None
+
+
 def _text(status: HTTPStatus, text: str) -> Response:
     return Response(text, status, media_type="text/plain" if text else None)
 
@@ -232,7 +229,7 @@ class _SendLimit(asyncio.Protocol):
 
 
 class HttpConnection(_SendLimit, H11Protocol):
-    """A connection that hands on a request when its head is complete and valid."""
+    """A connection that is closed if it does not send a request in time."""
 
     def __init__(self, guard: Guard, *args: Any, **options: Any) -> None:
         """``args``, ``options``: those of uvicorn."""
@@ -243,8 +240,6 @@ class HttpConnection(_SendLimit, H11Protocol):
             WebSocketConnection, guard
         )
         self.logger, self.access_log = _discard, False
-        self._received = b""  # data that follows the current request
-        self._body = 0  # bytes of the body of the current request that are not received yet
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -259,92 +254,34 @@ class HttpConnection(_SendLimit, H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        is_first = not self._received
-        self._received += data
-        self._advance(is_first)
+        was_idle = self.conn.their_state is h11.IDLE
+        super().data_received(data)
+        if not (was_idle and self.conn.their_state is h11.IDLE):  # a slow head gets no more time
+            self._set_deadline()
+
+    def _should_upgrade(self) -> bool:
+        # The parser of WebSockets would never answer other methods.
+        return self.scope["method"] == "GET" and super()._should_upgrade()
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
         self._receiving.set(None)
         self._sending.set(None)
         super().handle_websocket_upgrade(event)
-        rest, self._received = self._received, b""
-        if rest:
-            cast(asyncio.Protocol, self.transport.get_protocol()).data_received(rest)
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
-        if not self.transport.is_closing():
-            self._receiving.set(IDLE_SECONDS)
-            self._advance(True)
+        self._set_deadline()
 
-    def _advance(self, is_first: bool) -> None:
-        """Hand on what was received; ``is_first``: nothing of it was seen before."""
-        while self._received and not self.transport.is_closing():
-            if self._body:
-                end = min(self._body, len(self._received))
-                self._body -= end
-            elif not self._is_idle():
-                self.flow.pause_reading()  # until the current request is answered
-                return
-            else:
-                end = self._received.find(b"\r\n\r\n") + 4
-                is_whole = end >= 4
-                if not is_whole and len(self._received) <= _HEAD_SIZE:
-                    if is_first:
-                        self._receiving.set(_REQUEST_SECONDS)
-                    return
-                status = self._check(self._received[:end] if is_whole else self._received)
-                if status is not None:
-                    self._refuse(status)
-                    return
-            piece, self._received = self._received[:end], self._received[end:]
-            is_first = True
-            super().data_received(piece)
-            if self.transport.get_protocol() is self:
-                self._receiving.set(IDLE_SECONDS if self._body or self._is_idle() else None)
-
-    def _is_idle(self) -> bool:
-        """Whether the last request is answered."""
-        return bool(self.conn.states == {h11.CLIENT: h11.IDLE, h11.SERVER: h11.IDLE})
-
-    def _check(self, head: bytes) -> HTTPStatus | None:
-        """The status with which a request is rejected; None accepts it, and sets ``_body``."""
-        if len(head) > _HEAD_SIZE or head.count(b"\n") > _HEAD_LINES:
-            return HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
-        if not _HEAD.fullmatch(head):
-            return HTTPStatus.BAD_REQUEST
-        line, *lines = head[:-4].split(b"\r\n")
-        values: dict[bytes, list[bytes]] = {}
-        for name, _, value in (each.partition(b":") for each in lines):
-            values.setdefault(name.lower(), []).append(value.strip())
-        if any(len(values.get(name, [])) > 1 for name in (b"host", b"origin", b"content-length")):
-            return HTTPStatus.BAD_REQUEST
-        method = line.split(b" ")[0]
-        # uvicorn would log requests for other protocols, and never answer those by other methods.
-        if b"upgrade" in values and (method, values[b"upgrade"]) != (b"GET", [b"websocket"]):
-            return HTTPStatus.BAD_REQUEST
-        length = values.get(b"content-length", [b"0"])[0]
-        # Without a declared size, a body has no limit.
-        if b"transfer-encoding" in values or not re.fullmatch(rb"\d{1,18}", length):
-            return HTTPStatus.BAD_REQUEST
-        if int(length) and method not in (b"POST", b"PUT"):
-            return HTTPStatus.BAD_REQUEST
-        if int(length) > _BODY_SIZE:
-            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE
-        self._body = int(length)
-        return None
-
-    def _refuse(self, status: HTTPStatus) -> None:
-        """Answer what is not a request, and close the connection."""
-        head = f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Length: 0\r\n"
-        self._received = b""
-        self.transport.write(f"{head}Connection: close\r\n\r\n".encode())
-        self._sending.set(_SEND_SECONDS)
-        self.transport.close()
+    def _set_deadline(self) -> None:
+        """While a complete request is answered, there is none for receiving."""
+        is_read = self.conn.their_state not in (h11.IDLE, h11.SEND_BODY)
+        is_other = self.transport.get_protocol() is not self
+        closing = self.transport.is_closing()
+        self._receiving.set(None if is_read or is_other or closing else IDLE_SECONDS)
 
 
 class WebSocketConnection(_SendLimit, WebSocketsSansIOProtocol):
-    """A WebSocket that is closed if it exceeds the limits."""
+    """A WebSocket that is closed if its client does not receive what is sent to it."""
 
     def __init__(self, guard: Guard, *args: Any, **options: Any) -> None:
         """``args``, ``options``: those of uvicorn."""
@@ -352,11 +289,6 @@ class WebSocketConnection(_SendLimit, WebSocketsSansIOProtocol):
         self._guard = guard
         self.app = functools.partial(guard.answer, self)
         self.logger = self.conn.logger = _discard
-        self._events = self.conn.events_received
-        self.conn.events_received = self._counted  # type: ignore[method-assign]
-        self._budget = _BURST  # number of frames that may be received now
-        self._updated = self.loop.time()  # when the budget was updated
-        self._frames = 0  # number of frames of the current message
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -368,28 +300,10 @@ class WebSocketConnection(_SendLimit, WebSocketsSansIOProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        for start in range(0, len(data), _PIECE):  # so that little is processed before a rejection
-            if self.transport.is_closing():
-                return
-            super().data_received(data[start : start + _PIECE])
-            # What its parser answers to a line that is too long, such as a cookie, is not sent.
-            if self.conn.handshake_exc is not None and not self.handshake_initiated:
-                self.transport.write(b"".join(self.conn.data_to_send()))
-                self.transport.close()
-
-    def _counted(self) -> list[Any]:
-        """The new events; none if a page could not send them at this rate."""
-        events = self._events()
-        frames = [event for event in events if isinstance(event, Frame)]
-        now = self.loop.time()
-        self._budget = min(_BURST, self._budget + _RATE * (now - self._updated)) - len(frames)
-        self._updated = now
-        for frame in frames:
-            if frame.opcode not in CTRL_OPCODES:
-                self._frames = 0 if frame.fin else self._frames + 1
-            if self._frames >= _FRAMES:
-                self._budget = -1.0
-        if self._budget < 0.0:
-            self.transport.abort()
-            return []
-        return events
+        if self.transport.is_closing():
+            return
+        super().data_received(data)
+        # What its parser answers to a line that is too long, such as a cookie, is not sent.
+        if self.conn.handshake_exc is not None and not self.handshake_initiated:
+            self.transport.write(b"".join(self.conn.data_to_send()))
+            self.transport.close()

@@ -21,6 +21,7 @@ from uvicorn.server import ServerState
 
 from snowsplat.viewer.hosts import ANY_HOST, BACKLOG, KnownHosts, listen
 from snowsplat.viewer.http.guard import (
+    HEAD_SIZE,
     IDLE_SECONDS,
     MESSAGE_SIZE,
     Guard,
@@ -109,6 +110,7 @@ class WebServer:
             proxy_headers=False,
             log_config=None,
             timeout_keep_alive=int(IDLE_SECONDS),
+            h11_max_incomplete_event_size=HEAD_SIZE,
             ws_max_size=MESSAGE_SIZE,
             ws_per_message_deflate=False,
         )
