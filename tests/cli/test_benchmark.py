@@ -17,8 +17,7 @@ import pytest
 from PIL import Image
 
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
-from snowsplat.pipeline.benchmark.job import Job, SceneResult
-from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
+from snowsplat.pipeline.benchmark.job import SUITES, Job, SceneResult, suite_of
 from snowsplat.pipeline.options.benchmark import BenchmarkOptions
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError

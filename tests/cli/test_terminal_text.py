@@ -5,9 +5,8 @@ import sys
 
 import pytest
 
-from snowsplat.cli.main import main
+from snowsplat.cli.main import accept_all_characters, main, similar
 from snowsplat.cli.subcommands import SUBCOMMANDS
-from snowsplat.cli.terminal_text import accept_all_characters, similar
 
 
 @pytest.fixture

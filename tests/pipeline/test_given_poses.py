@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from snowsplat.pipeline.given_poses import given_poses
+from snowsplat.pipeline.make_plan import given_poses
 from snowsplat.pipeline.observer import Observer
 from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.sfm.ingest.search.sources import find_sources

@@ -15,8 +15,8 @@ from snowsplat.data import load_dataset
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.render import evaluate
-from snowsplat.pipeline.run.refined_cameras import with_refined, write_refined
 from snowsplat.pipeline.run.results import TrainResult
+from snowsplat.pipeline.run.training_files import with_refined, write_refined
 from snowsplat.pipeline.train import train
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.training.parts import pose_refinement

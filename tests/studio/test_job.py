@@ -24,7 +24,7 @@ from snowsplat.sfm.cost import Speed
 from snowsplat.studio import job, worker
 from snowsplat.studio.recorder import Recorder
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.core.progress import Progress
+from snowsplat.training.core.trainer import Progress
 from snowsplat.util.errors import UserError
 
 from ..waiting import wait_until

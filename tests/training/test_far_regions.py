@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from snowsplat.training.parts.direction_cells import COUNT, directions_of
-from snowsplat.training.parts.far_regions import in_far_regions
+from snowsplat.training.parts.far_regions import COUNT, directions_of, in_far_regions
 
 PHOTOS = 12
 

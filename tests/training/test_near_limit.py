@@ -10,7 +10,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.near_limit import INTERVAL, NearLimit, nearest_depth, unseen_cameras
+from snowsplat.training.parts.limits import INTERVAL, NearLimit, nearest_depth, unseen_cameras
 from snowsplat.training.settings.recipes import recipe
 
 from .stage import stage

@@ -8,7 +8,7 @@ from tests.gaussians import gaussians_in_box
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.parts.scale_limit import INTERVAL, ScaleLimit
+from snowsplat.training.parts.limits import INTERVAL, ScaleLimit
 from snowsplat.training.settings.recipes import recipe
 
 from .stage import stage

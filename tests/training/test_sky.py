@@ -22,7 +22,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, rotation_from_quat
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts import found_sky
-from snowsplat.training.parts.direction_cells import (
+from snowsplat.training.parts.far_regions import (
     ANGLE,
     COUNT,
     cells_of,

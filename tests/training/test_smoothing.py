@@ -8,7 +8,7 @@ from tests.gaussians import gaussians_in_box
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.parts.smoothing import INTERVAL, VARIANCE, SmoothingFilter
+from snowsplat.training.parts.limits import INTERVAL, VARIANCE, SmoothingFilter
 
 from .stage import stage
 

@@ -20,7 +20,7 @@ from snowsplat.data.photos.decode import ImageSource, load_views
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.near_limit import NearLimit
+from snowsplat.training.parts.limits import NearLimit
 from snowsplat.training.parts.part import REMOVED
 from snowsplat.training.parts.sky import INTERVAL, SkyPart
 from snowsplat.training.parts.transients import Transients

@@ -20,8 +20,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.progress import Progress
-from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.core.trainer import Progress, Trainer
 from snowsplat.training.core.view_queue import Background
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.parts.densification import Densification

@@ -5,7 +5,7 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.parts.near_limit import beside
+from snowsplat.training.parts.limits import beside
 
 TARGET = torch.zeros(3, dtype=torch.float64)
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)

@@ -14,8 +14,7 @@ import torch
 import scene
 from snowsplat import Gaussians
 from snowsplat.data.load import load_dataset
-from snowsplat.training.core.progress import Progress
-from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.core.trainer import Progress, Trainer
 from snowsplat.training.parts.densification import Densification
 from snowsplat.training.settings.recipes import recipe
 

@@ -3,19 +3,28 @@
 Exit codes: 0 success; 2 an error in the flags or the input, reported as one line on stderr;
 130 stopped by Ctrl-C, SIGTERM or SIGHUP, with all finished results saved; 141 the reader of the
 output has closed it. Any other failure is a defect of the program and shows a traceback.
+
+Text for terminals and pipes that cannot show all characters, such as latin-1, ASCII or cp437.
+
+Characters that the encoding of the terminal lacks are replaced by similar ones: "…" by "...", "×"
+by "x", the box of a help text by "+", "-" and "|". Files are not concerned: snowsplat writes all of
+them in UTF-8.
 """
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import errno
 import io
 import logging
 import os
 import sys
+import unicodedata
 import warnings
 from collections.abc import Sequence
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
+from io import TextIOWrapper
 from typing import TYPE_CHECKING, Any
 
 from snowsplat._version import __version__
@@ -23,7 +32,6 @@ from snowsplat.cli.command import next_step
 from snowsplat.cli.pages import has_screen
 from snowsplat.cli.reference_flags import translated
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, overview
-from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError, message_of
 from snowsplat.util.flags import with_flags
 from snowsplat.util.interrupts import ended_by_signals
@@ -44,6 +52,39 @@ _REMEDIES = {
 _OUT_OF_MEMORY = message(
     "out of memory; train with --memory and a smaller number, or use smaller photos, -r 2"
 )
+_ERRORS = "snowsplat-similar"  # the name of the error handler
+_SIMILAR = {
+    **dict.fromkeys("–—‐‑‒−─━╌┄", "-"),
+    **dict.fromkeys("│┃║╎┆", "|"),
+    **dict.fromkeys("╭╮╰╯┌┐└┘├┤┬┴┼╔╗╚╝", "+"),
+    **dict.fromkeys("‘’′", "'"),
+    **dict.fromkeys("“”″„«»", '"'),
+    **dict.fromkeys("·•∙●", "*"),
+    **dict.fromkeys("█▇▆▅▉▊▓", "#"),
+    **dict.fromkeys("▄▃▂▁▋▌▍▎▏▒░", "-"),
+    "×": "x",
+    "±": "+/-",
+    "≤": "<=",
+    "≥": ">=",
+    "≈": "~",
+    "≠": "!=",
+    "∞": "inf",
+    "√": "sqrt",
+    "→": "->",
+    "←": "<-",
+    "↔": "<->",
+    "↑": "^",
+    "↓": "v",
+    "✓": "ok",
+    "✗": "x",
+    "⚠": "!",
+    "°": " deg",
+    "µ": "u",
+    "σ": "sigma",
+    "Σ": "Sigma",
+    "α": "alpha",
+    "λ": "lambda",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -196,3 +237,31 @@ def _report_log_and_warnings_as_lines() -> None:
     if not logger.handlers:
         logger.addHandler(_LogHandler())
         logger.setLevel(logging.INFO)
+
+
+def accept_all_characters() -> None:
+    """Make stdout and stderr replace the characters that their encoding lacks."""
+    codecs.register_error(_ERRORS, _replace)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # not in all notebooks; None without a terminal
+            # Python looks for the position in a file, which a redirected stream may not have.
+            with suppress(OSError):
+                stream.reconfigure(errors=_ERRORS)
+
+
+def similar(character: str) -> str:
+    """``character`` in ASCII; it is escaped, as in ``\\u672c``, if no other is similar."""
+    if character in _SIMILAR:
+        return _SIMILAR[character]
+    if not unicodedata.category(character).startswith("L"):  # "½" -> "1/2", "²" -> "2"
+        plain = unicodedata.normalize("NFKD", character).replace("\N{FRACTION SLASH}", "/")
+        if plain.isascii():
+            return plain
+    # Letters are mostly those of a file name, which must not become the name of another file.
+    return character.encode("ascii", "backslashreplace").decode("ascii")
+
+
+def _replace(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    return "".join(map(similar, error.object[error.start : error.end])), error.end

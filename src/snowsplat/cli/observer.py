@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.observer import Page
     from snowsplat.pipeline.run.results import TrainResult
     from snowsplat.sfm.progress import Report
-    from snowsplat.training.core.progress import Progress as TrainingProgress
+    from snowsplat.training.core.trainer import Progress as TrainingProgress
     from snowsplat.util.stages import Outcome
 
 _LINE_SECONDS = 5.0

@@ -38,8 +38,7 @@ from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.scene.origin import Origin
 from snowsplat.scene.simplify import simplify
 from snowsplat.training.core.distillation import MERGED_RATES, distill
-from snowsplat.training.core.progress import Progress
-from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.core.trainer import Progress, Trainer
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import SettingError

@@ -17,8 +17,7 @@ from typing import Any
 from snowsplat import ops
 from snowsplat.data import Dataset, read_dataset
 from snowsplat.pipeline.all_photos import SHARE, train_on_all
-from snowsplat.pipeline.given_poses import given_poses
-from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
+from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described, given_poses
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.make import PRESETS, MakeOptions, Preset
 from snowsplat.pipeline.options.train import TrainOptions

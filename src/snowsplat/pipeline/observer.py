@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.run.results import TrainResult
     from snowsplat.project.training_folder import TrainingFolder
     from snowsplat.sfm.report.scene_map import PlacedPhoto
-    from snowsplat.training.core.progress import Progress
+    from snowsplat.training.core.trainer import Progress
     from snowsplat.util.stages import Outcome
 
 #: The columns of `CsvLog`. The last three are those of the held-out photos, in dB, after an

@@ -12,7 +12,7 @@ import torch
 
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.extras.image.compact_file import decode, encode, read_compact, write_compact
-from snowsplat.extras.image.model import ImageGaussians
+from snowsplat.extras.image.fit import ImageGaussians
 from snowsplat.extras.image.options import Blending
 from snowsplat.util.errors import UserError
 

@@ -7,8 +7,7 @@ import torch
 
 from snowsplat import ops
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.extras.image.fit import Fitter
-from snowsplat.extras.image.model import ImageGaussians
+from snowsplat.extras.image.fit import Fitter, ImageGaussians
 from snowsplat.extras.image.options import Blending, FitOptions
 from snowsplat.util.errors import SettingError
 

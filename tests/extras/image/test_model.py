@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from snowsplat.extras.image.model import ImageGaussians, column_count
+from snowsplat.extras.image.fit import ImageGaussians, column_count
 from snowsplat.extras.image.options import Blending
 
 BLENDINGS: tuple[Blending, ...] = ("front-to-back", "additive")

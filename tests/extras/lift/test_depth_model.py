@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.extras.lift.depth_model import estimate_depth
+from snowsplat.extras.lift.lift_photo import estimate_depth
 from snowsplat.util.errors import UserError
 
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])

@@ -11,7 +11,7 @@ from snowsplat.data import load_dataset
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.history import History
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.part_report import PartReport, Section
+from snowsplat.training.parts.part import PartReport, Section
 from snowsplat.training.report import Trained, write_training_report
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.util.messages import message

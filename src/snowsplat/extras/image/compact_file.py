@@ -28,7 +28,7 @@ from typing import get_args
 import numpy as np
 import torch
 
-from snowsplat.extras.image.model import (
+from snowsplat.extras.image.fit import (
     ANGLE,
     COLORS,
     LOG_SIGMAS,

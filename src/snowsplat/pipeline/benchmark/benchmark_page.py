@@ -14,8 +14,7 @@ from markupsafe import Markup
 from PIL import Image
 
 from snowsplat._version import __version__
-from snowsplat.pipeline.benchmark.job import WORST, SceneResult
-from snowsplat.pipeline.benchmark.suites import SUITES, Figures
+from snowsplat.pipeline.benchmark.job import SUITES, WORST, Figures, SceneResult
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_json, write_text
 from snowsplat.util.html import picture, render_page

@@ -12,8 +12,7 @@ import torch
 from snowsplat.data.readers import transforms_json
 from snowsplat.evaluation.lpips import Lpips, is_packaged
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
-from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
-from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
+from snowsplat.pipeline.benchmark.job import SUITES, Job, SceneResult, run, suite_of
 from snowsplat.pipeline.options.benchmark import BenchmarkOptions
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.messages import Message, as_message, message

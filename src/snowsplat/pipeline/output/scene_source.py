@@ -11,7 +11,7 @@ import torch
 from snowsplat.data import Dataset, read_dataset
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.run.refined_cameras import with_refined
+from snowsplat.pipeline.run.training_files import with_refined
 from snowsplat.project.edit_record import EditRecord, Note
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import Color, DatasetSettings, TrainingFolder

@@ -13,7 +13,7 @@ from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import TrainingFolder
-from snowsplat.training.parts.part_report import PartReport
+from snowsplat.training.parts.part import PartReport
 from snowsplat.util.messages import Message
 
 

@@ -17,12 +17,12 @@ from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.dataset_check import Stamp
 from snowsplat.pipeline.run.live_page import LivePage, Watchers
 from snowsplat.pipeline.run.processes import Collective
-from snowsplat.pipeline.run.refined_cameras import write_refined
 from snowsplat.pipeline.run.results import TrainingStopped, TrainResult
 from snowsplat.pipeline.run.training_files import (
     CheckpointMeta,
     write_beginning,
     write_cameras,
+    write_refined,
     write_scene,
 )
 from snowsplat.project.left_out import LeftOut
@@ -38,11 +38,9 @@ from snowsplat.training.budgets.memory_budget import MemoryPlan
 from snowsplat.training.budgets.pace import Pace, TimeBudget
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.history import History
-from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.run import Loss
-from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.part import Part
-from snowsplat.training.parts.part_report import PartReport
+from snowsplat.training.core.trainer import Progress, Trainer
+from snowsplat.training.parts.part import Part, PartReport
 from snowsplat.training.report import Trained, write_training_report
 from snowsplat.training.report.scene_verdict import scene_verdict
 from snowsplat.training.settings.stored import config_to_json

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -11,7 +12,6 @@ from torch import Tensor
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.scene.render import RenderOutput
-from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.run import Run, add_regularizers
 from snowsplat.training.core.view_graphs import Objective
 from snowsplat.training.step.batch import Batch, BatchView, batch_gradients
@@ -161,3 +161,21 @@ class Trainer(Run):
                 background=background,
                 render=self.render,
             )
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The report of `Trainer.run` after each step.
+
+    ``downscale`` is the factor by which the photos of the step were reduced. ``metrics`` is the
+    evaluation of the test views, after the steps of ``test_iterations``; None after other steps.
+    ``seconds_left`` is an estimate that `pipeline.run.training_run` adds.
+    """
+
+    step: int
+    loss: float
+    gaussians: int
+    iterations: int
+    downscale: int
+    metrics: Evaluation | None = None
+    seconds_left: float | None = None

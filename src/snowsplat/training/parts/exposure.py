@@ -32,8 +32,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.parts.exposed_image import ExposedImages
 from snowsplat.training.parts.exposure_start import GAMMA, ExposureStart, exposure_start
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
-from snowsplat.training.parts.part import Part
-from snowsplat.training.parts.part_report import PartReport, Section
+from snowsplat.training.parts.part import Part, PartReport, Section
 from snowsplat.training.step.batch import Batch, BatchView
 from snowsplat.util.messages import Message, message
 

@@ -25,15 +25,15 @@ from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.orientation import scene_up
-from snowsplat.training.parts.direction_cells import (
+from snowsplat.training.parts.far_regions import (
     ANGLE,
     COUNT,
     cells_of,
     directions_of,
+    in_far_regions,
     median_of,
     spread_of,
 )
-from snowsplat.training.parts.far_regions import in_far_regions
 from snowsplat.training.starts.photos import in_threads, reduced_photo, usable_pixels
 
 #: Distance of the sky from the middle of the cameras, in units of the root mean square of their

@@ -9,14 +9,12 @@ from snowsplat.training.parts.decay import Decay
 from snowsplat.training.parts.densification import Densification
 from snowsplat.training.parts.depth_supervision import DepthSupervision
 from snowsplat.training.parts.exposure import Exposure, exposure_hint
+from snowsplat.training.parts.limits import NearLimit, ScaleLimit, SmoothingFilter
 from snowsplat.training.parts.misalignment import PoseCheck
-from snowsplat.training.parts.near_limit import NearLimit
 from snowsplat.training.parts.normal_supervision import NormalSupervision
 from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.pose_refinement import PoseRefinement
-from snowsplat.training.parts.scale_limit import ScaleLimit
 from snowsplat.training.parts.sky import SkyPart
-from snowsplat.training.parts.smoothing import SmoothingFilter
 from snowsplat.training.parts.surfaces import Surfaces
 from snowsplat.training.parts.transients import Transients
 from snowsplat.training.parts.unexplained import Unexplained

@@ -24,8 +24,7 @@ from snowsplat.evaluation.metrics import renderings
 from snowsplat.evaluation.verdict import Reason
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
-from snowsplat.training.parts.part import Part
-from snowsplat.training.parts.part_report import PartReport
+from snowsplat.training.parts.part import Part, PartReport
 from snowsplat.util.messages import message
 from snowsplat.util.process import single_threaded
 

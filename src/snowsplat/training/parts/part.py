@@ -18,16 +18,20 @@ A part does not know any other part. What several parts need is in the `Run`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.dataset import Points
 from snowsplat.data.photos.decode import LoadedImage
+from snowsplat.evaluation.verdict import Reason
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import RenderOutput
-from snowsplat.training.parts.part_report import PartReport
 from snowsplat.training.step.batch import Batch, BatchView, Gradients
+from snowsplat.util.messages import Message
 
 if TYPE_CHECKING:  # these modules import this one
     from snowsplat.training.core.run import Run
@@ -35,6 +39,44 @@ if TYPE_CHECKING:  # these modules import this one
 #: The opacity of a removed Gaussian, as a logit. It is too transparent to be visible, so the
 #: optimiser does not restore it, and density control removes it or uses it elsewhere.
 REMOVED = -10.0
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the page about the training.
+
+    Attributes:
+        title: of the section.
+        text: its sentences.
+        values: a number for each training photo, which a chart shows; may be empty.
+        label: of these numbers; None: there are none.
+        masks: by the name of the training photo, of its size: 0 where the page tints the photo.
+    """
+
+    title: Message
+    text: tuple[Message, ...]
+    values: tuple[float, ...] = ()
+    label: Message | None = None
+    masks: Mapping[str, Image.Image] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PartReport:
+    """Everything may be empty.
+
+    Attributes:
+        lines: clauses without a full stop, for the terminal and the page.
+        reasons: for the verdict on the scene; among those of a grade, the worst one is first.
+        files: by their paths in the output folder: values of JSON, or images.
+        sections: of the page.
+        facts: what `sections` say, for programs.
+    """
+
+    lines: tuple[Message, ...] = ()
+    reasons: tuple[Reason, ...] = ()
+    files: Mapping[str, Any] = field(default_factory=dict)
+    sections: tuple[Section, ...] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Part:

@@ -33,8 +33,7 @@ from snowsplat.ops import camera_gradient
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.parts.misalignment import shift_of
-from snowsplat.training.parts.part import Part
-from snowsplat.training.parts.part_report import PartReport
+from snowsplat.training.parts.part import Part, PartReport
 from snowsplat.training.parts.pose_coordinates import Gauge, after_motion, pixel_hessian, whitening
 from snowsplat.training.step.batch import Batch, Gradients
 from snowsplat.training.step.view_gradient import ViewGradient

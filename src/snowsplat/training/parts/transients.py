@@ -47,8 +47,7 @@ from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.evaluation.metrics import renderings
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.parts.part import Part
-from snowsplat.training.parts.part_report import PartReport, Section
+from snowsplat.training.parts.part import Part, PartReport, Section
 from snowsplat.training.parts.view_residuals import (
     CellMap,
     Witnesses,

@@ -29,8 +29,7 @@ from snowsplat.evaluation.metrics import Rendering, color_fit, renderings
 from snowsplat.evaluation.verdict import Grade, Reason
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer
-from snowsplat.training.parts.part import Part
-from snowsplat.training.parts.part_report import PartReport, Section
+from snowsplat.training.parts.part import Part, PartReport, Section
 from snowsplat.training.parts.photo_agreement import confirmation
 from snowsplat.training.processes.shards import sharded_render
 from snowsplat.util.messages import Message, message, plural

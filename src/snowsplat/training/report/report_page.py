@@ -18,8 +18,8 @@ from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.history import History
-from snowsplat.training.parts.part_report import PartReport, Section
-from snowsplat.training.report import masks, pictures
+from snowsplat.training.parts.part import PartReport, Section
+from snowsplat.training.report import pictures
 from snowsplat.util import charts
 from snowsplat.util.files import write_text
 from snowsplat.util.html import render_page
@@ -127,10 +127,10 @@ def _curves(history: History) -> list[tuple[Message, Markup]]:
     return [(caption, drawing) for caption, drawing in drawings if drawing]
 
 
-def _sections(trained: Trained) -> list[tuple[Section, list[masks.Masked], Markup]]:
+def _sections(trained: Trained) -> list[tuple[Section, list[pictures.Masked], Markup]]:
     """The sections of the parts, with their photos and charts."""
     return [
-        (section, masks.masked(trained.dataset.train, section.masks), _chart(section))
+        (section, pictures.masked(trained.dataset.train, section.masks), _chart(section))
         for part in trained.parts
         for section in part.sections
     ]

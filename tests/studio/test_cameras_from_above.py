@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from snowsplat.data.points_ply import write_points
-from snowsplat.pipeline.cameras_from_above import cameras_from_above
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.geometry import look_at
+from snowsplat.studio.recorder import cameras_from_above
 from snowsplat.util.errors import UserError
 
 
