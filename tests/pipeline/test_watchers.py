@@ -1,21 +1,21 @@
 """`watch` and a training without a page: opening one, steering, leaving, and what a kill leaves."""
 
-import os
-import socket
+import json
 import stat
 import sys
 import threading
 import time
 import urllib.error
 import urllib.request
+from multiprocessing import AuthenticationError
+from multiprocessing.connection import Client
 from pathlib import Path
 
 import pytest
 
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
-from snowsplat.pipeline.run import live_page
-from snowsplat.pipeline.run.live_page import FOLDER, LivePage, socket_in
+from snowsplat.pipeline.run.live_page import ADDRESS, LivePage
 from snowsplat.pipeline.train import train
 from snowsplat.pipeline.watch import watch
 
@@ -79,19 +79,17 @@ class Watched(Observer):
     def step(self, progress) -> None:
         self.steps.append(progress.step)
         if progress.step == 5:
-            folder = self.out / FOLDER
-            self.mode = stat.S_IMODE(folder.stat().st_mode)
-            assert stat.S_ISSOCK((folder / "socket").stat().st_mode)
+            self.mode = stat.S_IMODE((self.out / ADDRESS).stat().st_mode)
             self.watcher = self.kind(self.out, self.steps)
         if self.watcher is not None:
             self.watcher.done.wait(2.0 if progress.step < 20 else 0.0)
 
 
 def test_a_watcher_steers_a_training_without_a_page(dataset, tmp_path):
-    out = tmp_path / ("a long name " * 9) / ("of a folder " * 9) / "out"  # too long for a socket
+    out = tmp_path / ("a long name " * 9) / ("of a folder " * 9) / "图像"  # too long for a socket
     seen = Watched(out)
     train(dataset, out, OPTIONS, observer=seen)
-    assert seen.mode == 0o700
+    assert seen.mode == 0o600
     assert seen.watcher is not None
     assert seen.watcher.done.wait(30)
     assert seen.watcher.failure is None
@@ -101,7 +99,7 @@ def test_a_watcher_steers_a_training_without_a_page(dataset, tmp_path):
     assert seen.steps[-1] == 30  # it resumed when the watcher left
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(seen.watcher.url, timeout=20)
-    assert not (out / FOLDER).exists()
+    assert not (out / ADDRESS).exists()
     plain = tmp_path / "plain"
     train(dataset, plain, OPTIONS)
     name = "point_cloud/iteration_30/point_cloud.ply"
@@ -139,37 +137,23 @@ class FolderOnly(Observer):
         raise Shown
 
 
-def test_the_socket_of_a_killed_training_is_harmless(dataset, tmp_path):
+@pytest.mark.parametrize("left", ['{"address": "/nowhere/s", "key": "00"}', "{}", "damaged"])
+def test_what_a_killed_training_leaves_is_harmless(dataset, tmp_path, left):
     out = tmp_path / "out"
     train(dataset, out, OPTIONS)
-    with socket_in(out, create=True) as path, socket.socket(socket.AF_UNIX) as stale:
-        stale.bind(path)
-    assert (out / FOLDER / "socket").exists()
+    (out / ADDRESS).write_text(left)
     with LivePage() as page, pytest.raises(Shown):
         watch(out, page, observer=FolderOnly())
     train(dataset, out, OPTIONS, overwrite=True)
-    assert not (out / FOLDER).exists()
+    assert not (out / ADDRESS).exists()
 
 
-@pytest.mark.parametrize("files", [None, "/nowhere"], ids=["Linux", "without /proc"])
-@pytest.mark.parametrize("name", ["out", "a very long name " * 9, "图像" * 30])
-def test_the_name_of_the_folder_may_be_long(tmp_path, monkeypatch, files, name):
-    """A path of a socket has at most 107 bytes here, and 103 on macOS."""
-    if files is not None:
-        monkeypatch.setattr(live_page, "_OPEN_FILES", files)
-    out = tmp_path / name
-    out.mkdir()
-    with socket.socket(socket.AF_UNIX) as listener, socket.socket(socket.AF_UNIX) as watcher:
-        with socket_in(out, create=True) as path:
-            listener.bind(path)
-            listener.listen()
-        assert (out / FOLDER / "socket").is_socket()
-        with socket_in(out) as path:
-            watcher.connect(path)
+def test_a_watcher_needs_the_key(dataset, tmp_path):
+    class Stranger(Observer):
+        def step(self, progress) -> None:
+            if progress.step == 5:
+                place = json.loads((tmp_path / "out" / ADDRESS).read_text())
+                with pytest.raises(AuthenticationError):
+                    Client(place["address"], authkey=b"another")
 
-
-def test_a_folder_of_others_is_not_used(tmp_path):
-    (tmp_path / FOLDER).mkdir()
-    os.chmod(tmp_path / FOLDER, 0o755)
-    with pytest.raises(PermissionError), socket_in(tmp_path):
-        pass
+    train(dataset, tmp_path / "out", OPTIONS, observer=Stranger())

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import socket
 import sys
 from contextlib import suppress
 from dataclasses import asdict
+from multiprocessing import AuthenticationError
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import load_dataset_of
-from snowsplat.pipeline.run.live_page import LivePage, PageReply, PageRequest, socket_in
+from snowsplat.pipeline.run.live_page import MOST, LivePage, PageReply, PageRequest, Place
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.edit import seen_from_dataset
@@ -87,24 +87,22 @@ def _attached(output: Path, page: LivePage, observer: Observer) -> bool:
     if sys.platform == "win32":
         return False
     request = PageRequest(page.port, page.host, tuple(page.allow_host))
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        try:
-            with socket_in(output) as path:
-                connection.connect(path)
-            connection.sendall(json.dumps(asdict(request)).encode() + b"\n")
-        except OSError:  # it has ended, or runs on another computer
-            return False
-        with connection.makefile("rb") as replies:
-            observer.inform("the training opens its page after the present step")
-            line = replies.readline()
-            if not line:
-                return True
-            reply = from_json(PageReply, parse_json(line))
-            if reply.error:
-                raise UserError(reply.error)
-            observer.inform("closing the page does not end the training")
-            observer.page_opened(reply)
-            replies.readline()
+    try:
+        connection = Place.of(output).connect()
+    except (OSError, ValueError, EOFError, AuthenticationError):
+        return False  # it has ended, or runs on another computer
+    with connection, suppress(OSError, EOFError):
+        connection.send_bytes(json.dumps(asdict(request)).encode())
+        observer.inform("the training opens its page after the present step")
+        answer = parse_json(connection.recv_bytes(MOST))
+        if answer is None:
+            return True
+        reply = from_json(PageReply, answer)
+        if reply.error:
+            raise UserError(reply.error)
+        observer.inform("closing the page does not end the training")
+        observer.page_opened(reply)
+        connection.recv_bytes(MOST)  # returns when the training ends
     return True
 
 

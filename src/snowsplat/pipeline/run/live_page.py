@@ -1,49 +1,46 @@
 """The page of a training: `LivePage`, and `Watchers`, with which `snowsplat watch` opens it later.
 
-A training listens at a local socket in its output folder, in a folder that only its owner can
-enter. A watcher sends one line of JSON, the address that the page shall have (`PageRequest`), and
-gets one, the URL of the page or an error (`PageReply`). The page stays until the last watcher
-closes its connection. The socket of a killed training refuses connections; the next run removes it.
+A training listens for watchers of the same user and computer. A file in its output folder, which
+only its user can read, has the address and a key. A watcher sends the address that the page shall
+have (`PageRequest`), and gets the URL of the page or an error (`PageReply`), both as JSON. The page
+stays until the last watcher closes its connection. The address of a killed training is refused; the
+next run replaces the file.
 
-A thread waits at the socket, so that a training which nobody watches does nothing for it.
+Threads wait for watchers, so that a training which nobody watches does nothing for them.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import selectors
-import socket
-import stat
+import secrets
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from multiprocessing import AuthenticationError
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from snowsplat.data import Dataset
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.run.processes import count
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.util.safe_json import from_json, parse_json
+from snowsplat.util.safe_json import from_json, parse_json, read_json
 from snowsplat.viewer.hosts import LOCAL_HOST, KnownHosts, listen
 
 if TYPE_CHECKING:  # most trainings have no page; importing its server takes 0.1 s
+    from multiprocessing.connection import Connection, Listener
+
     from snowsplat.viewer.live.training import TrainingViewer
     from snowsplat.viewer.live.viewer import NetworkViewer
 
-#: The folder of the socket, in the output folder.
-FOLDER = ".snowsplat.watch"
-_SOCKET = "socket"
-_MOST = 1 << 16  # bytes of a line
-_OPEN_FILES = "/proc/self/fd"  # on Linux
-_MOST_PATH = 100  # bytes of the path of a socket; 103 on macOS, 107 on Linux
-_SEND_SECONDS = 1.0  # a watcher that does not read its reply is not waited for
+#: The file with the address, in the output folder.
+ADDRESS = ".snowsplat.watch"
+MOST = 1 << 16  # bytes of a message
 
 
 @dataclass(frozen=True)
@@ -56,44 +53,34 @@ class PageRequest:
 
 
 @dataclass(frozen=True)
+class Place:
+    """Where a training listens: the content of the file."""
+
+    address: str
+    key: str  # hexadecimal
+
+    @classmethod
+    def of(cls, output: Path) -> Place:
+        """That of the training in a folder. Raises: OSError, ValueError: there is none."""
+        if (output / ADDRESS).stat().st_uid != os.getuid():
+            raise PermissionError(f"{output / ADDRESS} is that of another user")
+        return from_json(Place, read_json(output / ADDRESS))
+
+    def connect(self) -> Connection:
+        """A connection to the training. Raises: OSError, EOFError, ValueError,
+        AuthenticationError: it has ended, or runs on another computer."""
+        from multiprocessing.connection import Client
+
+        return Client(self.address, authkey=bytes.fromhex(self.key))
+
+
+@dataclass(frozen=True)
 class PageReply:
     """Where the page is, or why there is none."""
 
     url: str = ""
     others: list[str] = field(default_factory=list)
     error: str = ""
-
-
-@contextmanager
-def socket_in(output: Path, create: bool = False) -> Iterator[str]:
-    """The path of the socket of a training, valid inside the context.
-
-    Paths of sockets have at most about 100 bytes. On Linux, a short name of the open folder takes
-    the place of a longer path, and elsewhere a link in a private folder for temporary files.
-    Raises: OSError: there is no such folder, or other users can enter it or own it.
-    """
-    if create:
-        with suppress(FileExistsError):
-            (output / FOLDER).mkdir(mode=0o700)
-    folder = os.open(output / FOLDER, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    try:
-        if create:  # it may have been copied from elsewhere
-            os.fchmod(folder, 0o700)
-        status = os.fstat(folder)
-        if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
-            raise PermissionError(f"{output / FOLDER} is not that of this user only")
-        path, own = output / FOLDER / _SOCKET, Path(f"{_OPEN_FILES}/{folder}")
-        if own.exists():
-            yield str(own / _SOCKET)
-        elif len(os.fsencode(path)) <= _MOST_PATH:
-            yield str(path)
-        else:
-            with TemporaryDirectory(prefix="snow") as short:
-                link = Path(short) / "f"
-                link.symlink_to((output / FOLDER).absolute())
-                yield str(link / _SOCKET)
-    finally:
-        os.close(folder)
 
 
 class Watchers:
@@ -108,56 +95,47 @@ class Watchers:
         """
         self._output, self._trainer = output, trainer
         self._page, self._given = page, page is not None
-        self._listener: socket.socket | None = None
-        # What follows is shared with the thread.
+        self._listener: Listener | None = None
+        # What follows is shared with the threads.
         self._lock = threading.Lock()
-        self._asking: list[tuple[socket.socket, PageRequest]] = []
-        self._watching: set[socket.socket] = set()
-        self._deserted = False  # the last watcher has left the page
+        self._asking: list[tuple[Connection, PageRequest]] = []
+        self._watching: list[Connection] = []
+        self._deserted = self._ended = False  # the last watcher has left the page; the training
 
     def __enter__(self) -> Watchers:
-        # The page needs one process; Python has no such sockets on Windows, some file systems, too.
+        # The page needs one process. Some file systems have no files that only their user can read.
         if count() == 1 and sys.platform != "win32":
             with suppress(OSError):  # then nobody can watch
                 self._listen()
-        if self._listener is not None:
-            self._stop, self._stopped = socket.socketpair()
-            self._thread = threading.Thread(target=self._serve, daemon=True)
-            self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._listener is None:
             return
-        self._stop.close()
-        self._thread.join()
+        self._ended = True
+        with suppress(OSError, EOFError, AuthenticationError):
+            self._place.connect().close()  # wakes the thread that accepts connections
+        self._listener.close()
+        with self._lock:
+            for connection in [*self._watching, *(each for each, _ in self._asking)]:
+                _send(connection, None)
         self._close_page()
-        for end in (self._listener, self._stopped):
-            end.close()
-        self._remove_socket()
+        with suppress(OSError):  # the output folder was moved or removed
+            (self._output / ADDRESS).unlink()
 
     def _listen(self) -> None:
-        """Raises OSError: there is no folder, or the file system has no sockets."""
-        # The folder may be moved while the training runs.
-        self._place = os.open(self._output, os.O_RDONLY | os.O_DIRECTORY)
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            with socket_in(self._output, create=True) as path:
-                Path(path).unlink(missing_ok=True)
-                listener.bind(path)
-                listener.listen()
-        except OSError:
-            listener.close()
-            self._remove_socket()
-            raise
-        self._listener = listener
+        """Raises OSError: the file cannot be written, or there are no local sockets."""
+        from multiprocessing.connection import Listener
 
-    def _remove_socket(self) -> None:
-        with suppress(OSError):  # the output folder was removed
-            os.unlink(f"{FOLDER}/{_SOCKET}", dir_fd=self._place)
-        with suppress(OSError):
-            os.rmdir(FOLDER, dir_fd=self._place)
-        os.close(self._place)
+        key = secrets.token_bytes(32)
+        listener = Listener(authkey=key)
+        file = self._output / ADDRESS
+        file.unlink(missing_ok=True)  # of a killed training
+        self._place = Place(str(listener.address), key.hex())
+        with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as place:
+            json.dump(asdict(self._place), place)
+        self._listener = listener
+        threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
         """Update the page after a step; returns the seconds for which the training waited.
@@ -182,7 +160,7 @@ class Watchers:
             if not self._watching:
                 self._close_page()
 
-    def _answer(self, connection: socket.socket, request: PageRequest) -> None:
+    def _answer(self, connection: Connection, request: PageRequest) -> None:
         viewer = None if self._page is None else self._page.viewer
         if viewer is None:
             try:
@@ -198,7 +176,7 @@ class Watchers:
                 return
             self._page = page
         _send(connection, PageReply(viewer.url, viewer.others))
-        self._watching.add(connection)
+        self._watching.append(connection)
 
     def _close_page(self) -> None:
         page = self._page
@@ -206,56 +184,32 @@ class Watchers:
             self._page = None
             page.close()
 
-    # The following methods run in the thread.
+    # The following methods run in the threads.
 
-    def _serve(self) -> None:
-        assert self._listener is not None
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._listener, selectors.EVENT_READ)
-            selector.register(self._stopped, selectors.EVENT_READ)
-            while True:
-                for key, _ in selector.select():
-                    found: Any = key.fileobj
-                    if found is self._stopped:
-                        for each in list(selector.get_map().values()):
-                            if each.data is not None:
-                                each.fileobj.close()  # type: ignore[union-attr]
-                        return
-                    if found is self._listener:
-                        with suppress(OSError):  # the watcher has already gone
-                            connection, _ = self._listener.accept()
-                            connection.settimeout(_SEND_SECONDS)
-                            selector.register(connection, selectors.EVENT_READ, bytearray())
-                    elif not self._read(found, key.data):
-                        selector.unregister(found)
-                        self._leave(found)
-
-    def _read(self, connection: socket.socket, line: bytearray) -> bool:
-        """Read a part of the line of a watcher; False at the end of the connection."""
-        try:
-            received = connection.recv(_MOST)
-        except OSError:
-            return False
-        line += received
-        if not received or len(line) > _MOST:
-            return False
-        if line.endswith(b"\n"):
+    def _accept(self, listener: Listener) -> None:
+        while not self._ended:
             try:
-                request = from_json(PageRequest, parse_json(bytes(line)))
-            except ValueError:
-                return False
-            line.clear()
-            with self._lock:
-                if self._page is None:
-                    self._asking.append((connection, request))
-                else:
-                    self._answer(connection, request)
-        return True
+                connection = listener.accept()
+            except (OSError, EOFError, AuthenticationError):  # the watcher has already gone
+                continue
+            threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
 
-    def _leave(self, connection: socket.socket) -> None:
+    def _serve(self, connection: Connection) -> None:
+        with connection:
+            try:
+                request = from_json(PageRequest, parse_json(connection.recv_bytes(MOST)))
+                with self._lock:
+                    if self._page is None:
+                        self._asking.append((connection, request))
+                    else:
+                        self._answer(connection, request)
+                connection.recv_bytes(MOST)  # returns when the watcher leaves
+            except (OSError, EOFError, ValueError):
+                self._leave(connection)
+
+    def _leave(self, connection: Connection) -> None:
         with self._lock:
-            connection.close()
-            self._watching.discard(connection)
+            self._watching = [each for each in self._watching if each is not connection]
             self._asking = [each for each in self._asking if each[0] is not connection]
             viewer = None if self._page is None else self._page.viewer
             if not self._watching and viewer is not None and not self._given:
@@ -263,9 +217,10 @@ class Watchers:
                 self._deserted = True
 
 
-def _send(connection: socket.socket, reply: PageReply) -> None:
-    with suppress(OSError):  # the thread notices that the watcher has gone
-        connection.sendall(json.dumps(asdict(reply)).encode() + b"\n")
+def _send(connection: Connection, reply: PageReply | None) -> None:
+    """Send a reply; None: the training has ended."""
+    with suppress(OSError):  # its thread notices that the watcher has gone
+        connection.send_bytes(json.dumps(reply and asdict(reply)).encode())
 
 
 class LivePage:
