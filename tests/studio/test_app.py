@@ -24,6 +24,7 @@ from snowsplat.util.run_lock import Holder
 from snowsplat.viewer.http.server import WebServer
 
 from ..viewer import clients
+from ..waiting import wait_until
 
 
 def files(folder: Path) -> set[str]:
@@ -92,6 +93,22 @@ def test_start_and_stop(studio, holder):
         studio.library.find(name).folder / "state.json"
     ).unlink()  # it was killed before it said a word
     assert studio.ask(f"scenes/{name}")[1]["status"] == "interrupted"
+
+
+def test_the_example_takes_its_photos_first(studio, forked):
+    status, answer = studio.ask("scenes", "POST", {"title": "Example", "example": True})
+    assert status == 200
+    scene = studio.library.find(answer["name"])
+    wait_until(lambda: scene.state().get("now", {}).get("stage") == "demo", 60)
+    studio.ask(f"scenes/{scene.name}/stop", "POST", {})
+    wait_until(lambda: not job.is_running(scene), 60)
+    assert scene.state()["outcome"] == "stopped"
+    # It goes on from there.
+    assert scene.inputs() == [scene.photos]
+    assert studio.ask(f"scenes/{scene.name}/start", "POST", {"quality": "draft"}) == (200, {})
+    wait_until(lambda: scene.state().get("now", {}).get("stage") == "demo", 60)
+    studio.ask(f"scenes/{scene.name}/stop", "POST", {})
+    wait_until(lambda: not job.is_running(scene), 60)
 
 
 def test_a_damaged_scene_does_not_hide_the_others(studio):

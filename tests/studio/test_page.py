@@ -126,6 +126,17 @@ def test_what_the_photos_are_in_chinese(studio, forked, tmp_path):
         assert "broken.jpg: 无法解码（不是已知格式的图像）" in facts
         warning = "document.querySelector('[role=alert] [data-grade=poor]').textContent"
         assert page.evaluate(warning) == "4 张照片太少"
+        page.wait_for("document.querySelectorAll('.given .mark').length === 2", 60)
+        marked = "[...document.querySelectorAll('.given button')].slice(0, 2).map(b => b.title)"
+        assert set(page.evaluate(marked)) == {"photos/broken.jpg", "photos/zz.png"}
+        # A click leaves a photo out, and another one takes it back.
+        button = "document.querySelector('.given button[title=\"photos/zz.png\"]')"
+        (scene,) = studio.library.scenes()
+        for out, folder in (("true", scene.left_out), ("false", scene.photos)):
+            page.evaluate(f"{button}.click()")
+            page.wait_for(f"{button}.ariaPressed === '{out}' && !{button}.disabled")
+            there = [path for path in scene.folder.rglob("zz.png") if path.is_relative_to(folder)]
+            assert len(there) == 1
         assert not page.errors
 
 

@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snowsplat.studio import uploads
+from snowsplat.studio.given_photos import given_photos, leave_out
+from snowsplat.studio.library import UnknownScene
 from snowsplat.studio.uploads import NoSpace, Upload, WrongPart, safe_path, write_part
 from snowsplat.util.errors import UserError
 
@@ -36,6 +38,33 @@ def test_a_file_appears_when_it_is_complete(scene):
     assert send(scene, "tour/a.jpg", 10, 5, b"56789") == 10  # its answer was lost
     assert send(scene, "empty", 0, 0, b"") == 0
     assert (scene.photos / "empty").read_bytes() == b""
+
+
+def test_a_photo_that_is_left_out(scene):
+    """It is moved aside, is not sent again with its folder, and comes back."""
+    send(scene, "tour/a.jpg", 3, 0, b"012")
+    send(scene, "tour/b.jpg", 3, 0, b"012")
+    leave_out(scene, "tour/a.jpg", True)
+    assert received(scene) == {"tour/b.jpg": 3}
+    assert [(p.name, p.out) for p in given_photos(scene)] == [
+        ("tour/a.jpg", True),
+        ("tour/b.jpg", False),
+    ]
+    assert send(scene, "tour/a.jpg", 3, 0, b"012") == 3
+    assert received(scene) == {"tour/b.jpg": 3}
+    for name, out in (("tour/a.jpg", True), ("../a.jpg", True), ("tour/b.jpg", False)):
+        with pytest.raises(UnknownScene):
+            leave_out(scene, name, out)
+    leave_out(scene, "tour/a.jpg", False)
+    assert received(scene) == {"tour/a.jpg": 3, "tour/b.jpg": 3}
+
+
+def test_photos_in_a_folder_of_the_user_stay(library, tmp_path):
+    (tmp_path / "a.jpg").touch()
+    scene = library.new("a", [tmp_path])
+    with pytest.raises(UserError, match="remove the photo there"):
+        leave_out(scene, "a.jpg", True)
+    assert (tmp_path / "a.jpg").exists()
 
 
 def test_killed_before_a_complete_file_has_its_name(scene, monkeypatch):

@@ -55,7 +55,7 @@ def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
     """
     out = Path(output)
     check_output(out, lambda entry: entry.name in (PHOTOS, TRUTH, MADE))
-    truth = _take_photos(out / PHOTOS, observer)
+    truth = take_demo_photos(out / PHOTOS, observer)
     truth.write(out / TRUTH)
     made = make(out / PHOTOS, out / MADE, _OPTIONS, observer=observer)
     # On a slow machine, `make` uses only some of the photos, to finish in time.
@@ -65,7 +65,8 @@ def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
     return DemoResult(out / PHOTOS, out / TRUTH, made, errors)
 
 
-def _take_photos(folder: Path, observer: Observer) -> Truth:
+def take_demo_photos(folder: Path, observer: Observer) -> Truth:
+    """Ray trace the photos of the demo into ``folder``; those that are there are kept."""
     before, started = len(list(folder.glob("*.jpg"))), time.monotonic()
     truth = write_synthetic_photos(folder, report=observer.begin("demo"))
     total = len(truth.poses)

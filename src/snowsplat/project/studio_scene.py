@@ -53,6 +53,7 @@ class Job:
         inputs: files and folders of this machine; empty: those that were uploaded.
         quality: "draft", "normal" or "best"; None: not chosen.
         minutes: the time to finish within; None: as long as it takes.
+        example: whether the photos are those of the demo; the job makes them.
     """
 
     title: str
@@ -60,6 +61,7 @@ class Job:
     inputs: list[str]
     quality: str | None = None
     minutes: float | None = None
+    example: bool = False
 
     def settings(self) -> dict[str, Any]:
         """Those of `make` that are set: name -> value, see `MakeOptions`."""
@@ -82,6 +84,7 @@ class StudioScene:
         self.kept = kept = folder / _STUDIO if self.found else folder
         self.made = folder if self.found else folder / "made"
         self.photos = kept / "photos"
+        self.left_out = kept / "left_out"  # uploaded photos that the user does not want
         self.site = kept / "site"
         self.whole = kept / "whole"
         self.exports = kept / "exports"
@@ -169,6 +172,8 @@ class StudioScene:
         given = self.job.inputs
         if given:
             return [Path(path) for path in given]
+        if self.job.example:
+            return [self.photos]
         entries = sorted(self.photos.iterdir()) if self.photos.is_dir() else []
         entries = [e for e in entries if not (e.name.startswith(".") or e.name.endswith(PART))]
         zips = [entry for entry in entries if entry.suffix.lower() == ".zip"]
@@ -237,7 +242,7 @@ class StudioScene:
         files += [self.folder / name for names in TASKS.values() for name in names]
         for file in (*files, self.folder / _JOB):
             file.unlink(missing_ok=True)
-        for folder in (self.photos, self.folder):
+        for folder in (self.left_out, self.photos, self.folder):
             with suppress(OSError):  # there are photos, or other files
                 folder.rmdir()
         return self.photos if self.photos.exists() else None

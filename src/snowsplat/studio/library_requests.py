@@ -14,6 +14,7 @@ from urllib.parse import urljoin
 import segno
 from starlette.requests import Request
 
+from snowsplat.studio import job
 from snowsplat.studio.picture_requests import SUFFIXES
 from snowsplat.studio.requests import File, Studio, json_object
 from snowsplat.studio.scene_requests import summary
@@ -65,7 +66,11 @@ async def new(studio: Studio, request: Request) -> Any:
         )
     names = [path.name if is_folder(path) else path.stem for path in inputs]
     title = str(wanted.get("title") or "".join(names))
-    return {"name": studio.library.new(title, inputs).name}
+    scene = studio.library.new(title, inputs)
+    if wanted.get("example") is True:
+        scene.change(example=True, quality="draft")
+        job.start(scene)
+    return {"name": scene.name}
 
 
 #: Path, method, and answer.

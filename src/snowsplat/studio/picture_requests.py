@@ -15,15 +15,16 @@ from starlette.responses import Response
 from snowsplat.project.project import Project
 from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
+from snowsplat.studio.given_photos import PHOTO_SUFFIXES, given_photos
 from snowsplat.studio.library import UnknownScene
 from snowsplat.studio.requests import File, SceneRoutes, Studio
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file, printable
 
-_PHOTOS = 120  # of which small pictures are shown
+_PHOTOS = 120  # of a job, of which small pictures are shown
 _SMALL = 320  # pixels of their longer side
 #: Of photos, videos and zip files.
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".tif", ".tiff", ".mp4", ".mov", ".zip")
+SUFFIXES = (*PHOTO_SUFFIXES, ".mp4", ".mov", ".zip")
 
 
 async def picture(studio: Studio, request: Request, scene: StudioScene) -> Any:
@@ -45,6 +46,23 @@ async def photo(studio: Studio, request: Request, scene: StudioScene) -> Any:
     return Response(await asyncio.to_thread(small_jpeg, shown[number]), media_type="image/jpeg")
 
 
+async def given(studio: Studio, request: Request, scene: StudioScene) -> Any:
+    photos = await asyncio.to_thread(given_photos, scene)
+    return [{"name": photo.name, "out": photo.out} for photo in photos]
+
+
+async def given_photo(studio: Studio, request: Request, scene: StudioScene) -> Any:
+    name = request.path_params["photo"]
+    photos = await asyncio.to_thread(given_photos, scene)
+    path = next((photo.path for photo in photos if photo.name == name), None)
+    if path is None:
+        raise UnknownScene("there is no such photo")
+    try:
+        return Response(await asyncio.to_thread(small_jpeg, path), media_type="image/jpeg")
+    except UserError:  # a damaged photo is listed, without a picture
+        return Response(status_code=204)
+
+
 async def map_of(studio: Studio, request: Request, scene: StudioScene) -> Any:
     policy = "sandbox; default-src 'none'; style-src 'unsafe-inline'"
     kept = {"Content-Disposition": "attachment"}  # <img> shows it; nobody opens it as a page
@@ -55,6 +73,8 @@ ROUTES: SceneRoutes = (
     ("/picture", "GET", picture),  # a small picture of it
     ("/photos", "GET", photos),  # its photos, and which have a pose
     ("/photos/{number:int}", "GET", photo),  # a small one
+    ("/given", "GET", given),  # the photos that were given, and which are left out
+    ("/given/{photo:path}", "GET", given_photo),  # a small one
     ("/map", "GET", map_of),  # the cameras and points from above
 )
 
@@ -79,7 +99,7 @@ def shown_photos(scene: StudioScene) -> list[Path]:
             found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
             step = max(1, math.ceil(len(found) / _PHOTOS))
             return found[::step]
-    return []
+    return [photo.path for photo in given_photos(scene) if not photo.out][:_PHOTOS]
 
 
 def picture_of(scene: StudioScene) -> Path | None:

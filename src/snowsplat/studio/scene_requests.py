@@ -15,6 +15,7 @@ from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.project.project import Project
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio import job
+from snowsplat.studio.given_photos import leave_out
 from snowsplat.studio.hand_on import FORMATS, export_command, make_command
 from snowsplat.studio.library import safe_title
 from snowsplat.studio.picture_requests import picture_of
@@ -97,6 +98,21 @@ async def survey(studio: Studio, request: Request, scene: StudioScene) -> Any:
         return await asyncio.to_thread(job.work, scene, "survey")
 
 
+async def marks(studio: Studio, request: Request, scene: StudioScene) -> Any:
+    async with studio.locks["", "survey"]:
+        return await asyncio.to_thread(job.work, scene, "marks")
+
+
+async def change_given(studio: Studio, request: Request, scene: StudioScene) -> Any:
+    wanted = await json_object(request)
+    if job.is_running(scene):
+        raise UserError("the scene is being made; stop it, then choose the photos")
+    async with studio.locks[scene.name, "upload"]:
+        name, out = str(wanted.get("name")), wanted.get("out") is True
+        await asyncio.to_thread(leave_out, scene, name, out)
+    return {}
+
+
 async def start(studio: Studio, request: Request, scene: StudioScene) -> Any:
     wanted = await json_object(request)
     title = safe_title(str(wanted.get("title") or scene.job.title))
@@ -126,6 +142,8 @@ ROUTES: SceneRoutes = (
     ("/uploads", "GET", arrived),  # what has arrived
     ("/uploads", "PUT", upload),  # adds a part
     ("/survey", "POST", survey),  # what the photos are, and how long it takes
+    ("/marks", "POST", marks),  # which photos are blurred, damaged or doubles
+    ("/given", "POST", change_given),  # leaves a photo out, or takes it back
     ("/start", "POST", start),
     ("/stop", "POST", stop),
 )
@@ -135,13 +153,15 @@ def summary(scene: StudioScene) -> dict[str, Any]:
     """A scene in the list of all; one whose file is damaged does not hide the others."""
     try:
         about: dict[str, Any] = {"title": scene.job.title, "created": scene.job.created}
+        about["picture"] = picture_of(scene) is not None
         status = status_of(scene, scene.state())
         about["status"] = "done" if status == "opening" else status
         verdict = verdict_on(scene, status)
         about["grade"] = verdict and verdict.grade
     except UserError:
         about = {"title": scene.name, "created": "", "status": "failed", "grade": None}
-    return {"name": scene.name, "picture": picture_of(scene) is not None, **about}
+        about["picture"] = False
+    return {"name": scene.name, **about}
 
 
 def details(scene: StudioScene) -> dict[str, Any]:

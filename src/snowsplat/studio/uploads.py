@@ -98,9 +98,10 @@ def write_part(scene: StudioScene, file: Upload, data: bytes) -> int:
     if file.modified > _LATEST:
         raise UserError("{path}: its time is after the year 9999", path=path)
     target = scene.photos / safe_path(path)
-    for other in _numbered(target):
-        if not other.exists():
-            break
+    there = itertools.takewhile(Path.exists, _numbered(target))
+    # A photo that the user has left out is not taken again when its folder is dropped again.
+    left_out = scene.left_out / safe_path(path)
+    for other in (*there, *([left_out] if left_out.exists() else [])):
         about = other.stat()
         if (about.st_size, about.st_mtime_ns // 1_000_000) == (size, file.modified):
             return size  # the answer to its last part was lost, or it is dropped again

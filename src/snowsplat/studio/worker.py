@@ -18,7 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from snowsplat.pipeline.convert import convert
+from snowsplat.pipeline.demo import take_demo_photos
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.edit import film, film_preview
 from snowsplat.pipeline.make import make
@@ -30,13 +33,17 @@ from snowsplat.project.project import scene_at
 from snowsplat.project.studio_scene import TASKS, StudioScene, version_of
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, predicted_seconds, survey
+from snowsplat.sfm.ingest.photos.photo_files import Unusable, read_header
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.report.capture_verdict import few_photos
+from snowsplat.sfm.report.photo_problems import PROBLEMS, problems_of, small_grey
 from snowsplat.studio import changes
+from snowsplat.studio.given_photos import given_photos
 from snowsplat.studio.library import safe_name
 from snowsplat.studio.recorder import Recorder
 from snowsplat.studio.texts import in_languages
 from snowsplat.util.errors import UserError, message_of
+from snowsplat.util.files import shown
 from snowsplat.util.flags import settings_from
 from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.messages import Message, message
@@ -90,6 +97,8 @@ def _make(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
         scene.begun.unlink(missing_ok=True)
     job = scene.job
     scene.map.unlink(missing_ok=True)  # the photos may be others now
+    if job.example:
+        take_demo_photos(scene.photos, recorder)
     if (given := _given_scene(scene)) is not None:
         recorder.begin("page")
         file = scene.made / f"{safe_name(job.title)}.ply"
@@ -169,6 +178,29 @@ def survey_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
     }
 
 
+def mark_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
+    """What is wrong with single photos, by the name in `given_photos`: damaged, double, blurred …
+
+    Raises: UserError: there is nothing to use.
+    """
+    given = [photo for photo in given_photos(scene) if not photo.out]
+    reasons = {each.photo: each.reason for each in find_sources(scene.inputs()).left_out}
+    marks: dict[str, Message] = {}
+    greys: dict[str, np.ndarray] = {}
+    for photo in given:
+        try:
+            read_header(photo.path)
+            greys[photo.name] = small_grey(photo.path)
+        except (Unusable, OSError) as error:
+            marks[photo.name] = message_of(error) if isinstance(error, OSError) else error.message
+        if (reason := reasons.get(shown(photo.path))) is not None:
+            marks[photo.name] = reason
+    for name, problem in zip(greys, problems_of(greys.values()), strict=True):
+        if problem is not None:
+            marks.setdefault(name, PROBLEMS[problem].what)
+    return {"marks": {name: in_languages(why) for name, why in marks.items()}}
+
+
 def _in_languages(value: Any) -> Any:
     """A fact with its texts in each language: see `in_languages`."""
     if isinstance(value, dict):
@@ -197,6 +229,7 @@ class Verb:
 
 VERBS = {
     "survey": Verb(survey_photos, changes=False),
+    "marks": Verb(mark_photos, changes=False),
     "preview": Verb(_preview, changes=False),
     "export": Verb(changes.export, changes.Export),
     "show": Verb(changes.show_scene),

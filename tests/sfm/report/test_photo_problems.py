@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from snowsplat.sfm.report.photo_problems import problem_of, problems
+from snowsplat.sfm.report.photo_problems import problems, problems_of
 
 
 @pytest.fixture
@@ -26,15 +26,25 @@ def moved(image: Image.Image, pixels: int) -> Image.Image:
 
 
 def test_blur(sharp):
-    assert problem_of(np.asarray(sharp)) is None
-    assert problem_of(np.asarray(sharp.filter(ImageFilter.GaussianBlur(2)))) == "blurred"
-    assert problem_of(np.asarray(moved(sharp, 30))) == "blurred"
+    blurred = sharp.filter(ImageFilter.GaussianBlur(2))
+    photos = [sharp, sharp, blurred, sharp, sharp, moved(sharp, 30), sharp, sharp, sharp]
+    found = problems_of(map(np.asarray, photos))
+    assert [i for i, problem in enumerate(found) if problem == "blurred"] == [2, 5]
+    assert problems_of([np.asarray(blurred)]) == ["blurred"]  # with nothing to compare
+
+
+def test_what_is_smooth_is_not_blurred(sharp):
+    """Photos of skin or of a white table have little detail, and so have those beside them."""
+    smooth = np.asarray(sharp.filter(ImageFilter.GaussianBlur(2)))
+    detailed = np.asarray(sharp)
+    assert problems_of([smooth] * 6) == [None] * 6
+    assert problems_of([detailed] * 20 + [smooth] * 8) == [None] * 28
 
 
 def test_exposure(sharp):
     pixels = np.asarray(sharp)
-    assert problem_of(pixels // 4) == "dark"
-    assert problem_of(np.minimum(pixels * 2.2, 255).astype(np.uint8)) == "bright"
+    bright = np.minimum(pixels * 2.2, 255).astype(np.uint8)
+    assert problems_of([pixels // 4, bright, pixels]) == ["dark", "bright", None]
 
 
 def test_a_folder(sharp, tmp_path):

@@ -4,7 +4,7 @@ import { action, ask, command, duration, make } from "./page.js";
 import { againPart, start } from "./scene_start.js";
 import { dressed, say, told } from "./text.js";
 
-const STAGES = ["photos", "poses", "images", "report", "scene", "pictures", "all", "page"];
+const STAGES = ["demo", "photos", "poses", "images", "report", "scene", "pictures", "all", "page"];
 
 /** The stages, the photos, the map and the figures of the training. */
 export function progressPart(/** @type {import("./scene.js").ScenePage} */ page) {
@@ -102,7 +102,8 @@ function showStages(/** @type {HTMLElement} */ list, /** @type {import("./types.
         name =>
             done.has(name) ||
             name === current ||
-            (scene.status === "running" && STAGES.indexOf(name) > STAGES.indexOf(current)),
+            // Only the example has the first stage.
+            (scene.status === "running" && STAGES.indexOf(name) > Math.max(0, STAGES.indexOf(current))),
     );
     list.replaceChildren(
         ...names.map(name => {

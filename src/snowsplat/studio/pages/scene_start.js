@@ -1,6 +1,7 @@
 // The start of a job: what the photos are, and the form.
 
 import { action, ask, command, duration, make, reasonOf } from "./page.js";
+import { showGiven } from "./scene_photos.js";
 import { moreFiles } from "./scene_upload.js";
 import { say, told } from "./text.js";
 
@@ -13,9 +14,11 @@ export function startPart(
 ) {
     const facts = make("section.card", {}, make("p", {}, say("looking")));
     const form = startForm(page, scene, say("start"));
+    const photos = make("section.card", { hidden: true });
     form.hidden = true;
     look();
-    return [facts, form];
+    if (!scene.found) showGiven(page, photos, look).catch(() => (photos.hidden = true));
+    return [facts, form, photos];
 
     async function look() {
         try {

@@ -37,6 +37,7 @@ function showStart(/** @type {AbortSignal} */ closed) {
             {},
             make("label.button.main", {}, say("choose_files"), files),
             make("label.button.plain", {}, say("choose_folder"), folder),
+            make("button.plain", { type: "button", click: action(example) }, say("try_example")),
         ),
         make("p.soft", {}, say("private")),
     );
@@ -99,6 +100,12 @@ async function begin(/** @type {import("./upload.js").Item[]} */ items) {
     } catch (error) {
         notice(reasonOf(error));
     }
+}
+
+/** A scene whose photos are rendered first; it begins at once. */
+async function example() {
+    const { name } = await ask("scenes", "POST", { title: say("example"), example: true });
+    location.hash = encodeURIComponent(name);
 }
 
 /** Chooses a folder of the machine where the studio runs. */

@@ -34,6 +34,7 @@
  * @property {Result} [result]
  */
 
+/** @typedef {{name: string, out: boolean}} Given a photo of a scene that has not begun, and whether it is left out */
 /** @typedef {{stage: string, lines: Told[], seconds: number, again: boolean}} Stage */
 /** @typedef {{stage: string, done?: number, total?: number, what?: Told, left?: number | null}} Now */
 /** @typedef {{step: number, iterations: number, gaussians: number, left: number, psnr?: number}} Steps */

@@ -1,0 +1,71 @@
+"""The photos that were given for a scene, before its job, and those that are left out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from snowsplat.project.studio_scene import StudioScene
+from snowsplat.studio.library import UnknownScene
+from snowsplat.util.errors import UserError
+from snowsplat.util.natural_order import natural_key
+
+#: Of the photos that are shown.
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".tif", ".tiff")
+_MOST = 2000  # photos that are listed
+
+
+@dataclass(frozen=True)
+class GivenPhoto:
+    """A photo that was given.
+
+    Attributes:
+        name: relative to the upload or to the input, with "/".
+        out: whether the user has left it out.
+    """
+
+    name: str
+    path: Path
+    out: bool
+
+
+def given_photos(scene: StudioScene) -> list[GivenPhoto]:
+    """The photos in natural order of their names; empty if nothing was given."""
+    if scene.found:
+        return []
+    roots = [Path(path) for path in scene.job.inputs] or [scene.photos]
+    found = [photo for root in roots for photo in _photos_in(root, False)]
+    found += _photos_in(scene.left_out, True)
+    return sorted(found, key=lambda photo: natural_key(photo.name))[:_MOST]
+
+
+def leave_out(scene: StudioScene, name: str, out: bool) -> None:
+    """Move an uploaded photo away from those that the scene is made of, or back.
+
+    Raises:
+        UserError: the photos are in a folder of the user.
+        UnknownScene: there is no such photo, or it is there already.
+    """
+    if scene.job.inputs:
+        raise UserError(
+            "the photos are in {inputs}; remove the photo there", inputs=scene.job.inputs[0]
+        )
+    found = next((p for p in given_photos(scene) if p.name == name and p.out != out), None)
+    target = (scene.left_out if out else scene.photos) / name
+    if found is None or target.exists():
+        raise UnknownScene("there is no such photo")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(found.path, target)
+
+
+def _photos_in(root: Path, out: bool) -> Iterator[GivenPhoto]:
+    if root.suffix.lower() in PHOTO_SUFFIXES and root.is_file():
+        yield GivenPhoto(root.name, root, out)
+    for folder, folders, names in os.walk(root):
+        folders[:] = [each for each in folders if not each.startswith(".")]
+        for name in names:
+            path = Path(folder) / name
+            if path.suffix.lower() in PHOTO_SUFFIXES and not name.startswith("."):
+                yield GivenPhoto(path.relative_to(root).as_posix(), path, out)
