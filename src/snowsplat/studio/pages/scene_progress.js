@@ -9,6 +9,7 @@ const STAGES = ["demo", "photos", "poses", "images", "report", "scene", "picture
 /** The stages, the photos, the map and the figures of the training. */
 export function progressPart(/** @type {import("./scene.js").ScenePage} */ page) {
     const stages = make("ol.stages");
+    const present = make("div.present");
     const figures = make("dl.figures");
     const curve = make("div.curve");
     const strip = make("div.strip", {
@@ -33,6 +34,7 @@ export function progressPart(/** @type {import("./scene.js").ScenePage} */ page)
     page.update = now => {
         const state = now.state;
         showStages(stages, now);
+        showNow(present, state);
         showFigures(figures, curve, state);
         notesPart.hidden = !state.notes?.length;
         notes.replaceChildren(...(state.notes ?? []).map(line => make("li", {}, told(line))));
@@ -53,18 +55,12 @@ export function progressPart(/** @type {import("./scene.js").ScenePage} */ page)
         }
     };
     return [
+        make("section.card.row", {}, present, make("div.stop", {}, stop, make("span.soft", {}, say("stop_help")))),
         live,
         // The map is beside the stages, so that it is seen while it grows.
-        make(
-            "div.row.wide",
-            {},
-            make("section.card", {}, stages, make("div.row", {}, stop, make("span.soft", {}, say("stop_help")))),
-            mapBox,
-        ),
+        make("div.row.wide", {}, make("section.card", {}, stages), mapBox),
         strip,
-        figures,
-        curve,
-        notesPart,
+        make("details.card", {}, make("summary", {}, say("more")), figures, curve, notesPart),
     ];
 }
 
@@ -95,7 +91,7 @@ export function stoppedPart(
 }
 
 function showStages(/** @type {HTMLElement} */ list, /** @type {import("./types.js").Scene} */ scene) {
-    const { stages = [], now, steps } = scene.state;
+    const { stages = [], now } = scene.state;
     const done = new Map(stages.map(each => [each.stage, each]));
     const current = now?.stage ?? "";
     const names = STAGES.filter(
@@ -118,31 +114,26 @@ function showStages(/** @type {HTMLElement} */ list, /** @type {import("./types.
                 item.append(
                     make("span.soft", {}, ` ${result}(${past.again ? say("before") : duration(past.seconds)})`),
                 );
-            } else if (now && name === current) {
-                const training = name === "scene" && steps;
-                const [count, total, left] = training
-                    ? [steps.step, steps.iterations, steps.left]
-                    : [now.done ?? 0, now.total, now.left];
-                const what = training ? say("step").toLowerCase() : told(now.what ?? "");
-                const time = left ? ` – ${say("left", duration(left))}` : "";
-                item.append(
-                    make(
-                        "span.soft",
-                        {},
-                        total
-                            ? ` ${what} ${say("of", count.toLocaleString(), total.toLocaleString())}${time}`
-                            : ` ${what}${time}`,
-                    ),
-                    make(
-                        "progress",
-                        total
-                            ? { max: total, value: count, "aria-label": say(`stage_${name}`) }
-                            : { "aria-label": say(`stage_${name}`) },
-                    ),
-                );
             }
             return item;
         }),
+    );
+}
+
+/** The stage that runs, how far it is, and the time that is left. */
+function showNow(/** @type {HTMLElement} */ element, /** @type {import("./types.js").State} */ { now, steps }) {
+    if (!now) return element.replaceChildren(make("p", {}, "…"));
+    const training = now.stage === "scene" && steps;
+    const [count, total, left] = training
+        ? [steps.step, steps.iterations, steps.left]
+        : [now.done ?? 0, now.total, now.left];
+    const name = say(`stage_${now.stage}`);
+    const what = training ? say("step").toLowerCase() : told(now.what ?? "");
+    const number = total ? ` ${say("of", count.toLocaleString(), total.toLocaleString())}` : "";
+    element.replaceChildren(
+        make("p", {}, make("b", {}, name), make("span.soft", {}, ` ${what}${number}`)),
+        make("progress", { ...(total ? { max: total, value: count } : {}), "aria-label": name }),
+        make("p.soft", {}, left ? say("left", duration(left)) : ""),
     );
 }
 

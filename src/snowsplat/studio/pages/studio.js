@@ -170,6 +170,11 @@ function dress() {
     document.documentElement.dataset.theme = chosenTheme();
     speak(chosenLanguage());
     const theme = /** @type {HTMLElement} */ (document.getElementById("theme"));
+    // The pages inside this one have no buttons of their own.
+    for (const frame of document.querySelectorAll("iframe")) {
+        const inner = frame.contentDocument?.documentElement;
+        if (inner) inner.dataset.theme = chosenTheme();
+    }
     theme.textContent = `◐ ${say(chosenTheme())}`;
     theme.ariaLabel = say("colours", say(chosenTheme()));
     /** @type {HTMLElement} */ (document.getElementById("language")).textContent = say("other");

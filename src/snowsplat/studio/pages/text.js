@@ -112,6 +112,7 @@ const TEXTS = {
         "任务意外结束（可能被终止或电脑关机）。点击“继续”从已保存的部分接着做。",
     ],
     was_stopped: ["Continue goes on from what was saved.", "点击“继续”从已保存的部分接着做。"],
+    more: ["More", "更多"],
     stage_demo: ["Taking photos of a synthetic scene", "拍摄合成场景的照片"],
     stage_photos: ["Reading the photos", "读取照片"],
     stage_poses: ["Finding the cameras", "估计相机位置"],

@@ -181,6 +181,8 @@ const switchTheme = () => {
 };
 // The page of the studio says its colours in the address.
 const colours = new URLSearchParams(location.search).get("theme") ?? "";
+// The page of the studio, which shows this one, has the buttons.
+byId("theme").hidden = byId("language").hidden = colours !== "";
 if (["light", "dark"].includes(colours)) document.documentElement.dataset.theme = colours;
 
 /** @param {boolean} open */
