@@ -141,9 +141,9 @@ def _quality(made: MakeResult) -> list[Message]:
     figures = message(
         "PSNR {psnr:.2f} dB, colour-aligned PSNR {aligned:.2f} dB, SSIM {ssim:.3f}", **values
     )
-    if known.exposures:  # the scene has the mean exposure of the photos, not that of each of them
+    if known.exposures:  # the exposures of the held-out photos are others
         figures = message(
-            "colour-aligned PSNR {aligned:.2f} dB (gains of exposure are learnt), SSIM {ssim:.3f}",
+            "PSNR {psnr:.2f} at mean exposure, colour-aligned {aligned:.2f} dB, SSIM {ssim:.3f}",
             **values,
         )
     lines = [
