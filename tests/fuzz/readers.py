@@ -30,6 +30,7 @@ from PIL import Image
 from pillow_heif import register_heif_opener
 
 from snowsplat.data import load_dataset
+from snowsplat.data.maps.map_files import read_depth_file, read_normal_file
 from snowsplat.data.maps.mask_pixels import doubt_about_files, looks_like_mask
 from snowsplat.data.photos.colour_profile import to_srgb
 from snowsplat.data.photos.decode import ImageSource, load_image, load_mask
@@ -421,7 +422,7 @@ def _save_image(path: Path, kind: str) -> None:
 IMAGES = {
     "jpg": "jpg", "progressive": "jpg", "png": "png", "rgba": "png", "palette": "png",
     "deep": "png", "webp": "webp", "lossless": "webp", "tif": "tif", "lzw": "tif", "bmp": "bmp",
-    "ppm": "ppm",
+    "ppm": "ppm", "avif": "avif",
 }  # fmt: skip
 
 
@@ -489,6 +490,21 @@ def _mask(mode: str, ending: str) -> Reader:
 
     pack = _png_with_checksums if ending == "png" else None
     return Reader(f"mask {mode} {ending}", file, make, read, pack=pack, extra=_image_memory)
+
+
+def _map(file: str, valid: np.ndarray) -> Reader:
+    def make(folder: Path) -> None:
+        if file.endswith("pfm"):
+            (folder / file).write_bytes(b"Pf\n%d %d\n-1\n" % valid.shape[::-1] + valid.tobytes())
+        elif file.endswith("npy"):
+            np.save(folder / file, valid)
+        else:
+            Image.fromarray(valid).save(folder / file)
+
+    read = read_depth_file if valid.ndim == 2 else read_normal_file
+    pack = _png_with_checksums if file.endswith("png") else None
+    name = f"map {file} {valid.ndim}"
+    return Reader(name, file, make, lambda f: read(f / file), pack=pack, extra=_image_memory)
 
 
 def _profile(mode: str, profile: Callable[[], bytes]) -> Reader:
@@ -741,6 +757,11 @@ READERS: tuple[Reader, ...] = (
     *(_image(kind, ending, "image", _read_image) for kind, ending in IMAGES.items()),
     *(_image(kind, end, "photo", _read_photo) for kind, end in (IMAGES | {"heic": "heic"}).items()),
     *(_mask(mode, ending) for mode, ending in MASKS.items()),
+    *(
+        _map(file, np.full((30, 40), 7, dtype))
+        for file, dtype in {"a.png": "u2", "a.tif": "f4", "a.npy": "f4", "a.pfm": "f4"}.items()
+    ),
+    _map("a.npy", np.full((30, 40, 3), (0, 0, -1), "f4")),
     _profile("RGB", lambda: colour_profiles.colour_profile(colour_profiles.PROPHOTO, 1.8)),
     _profile("L", lambda: colour_profiles.grey_profile(1.8)),
     _profile("CMYK", lambda: colour_profiles.cmyk_profile(0.1)),

@@ -219,8 +219,9 @@ def test_no_splats(variant: Variant) -> None:
     assert background.grad.tolist() == [20, 20, 20]
 
 
+@pytest.mark.parametrize("additive", [False, True])
 @pytest.mark.parametrize("with_depth", [False, True])
-def test_finite_differences(double: Variant, with_depth: bool) -> None:
+def test_finite_differences(double: Variant, with_depth: bool, additive: bool) -> None:
     """Every column and the background, for splats that are not near a threshold."""
     with torch.no_grad():
         splats = smooth_scene().project(reference)
@@ -231,8 +232,11 @@ def test_finite_differences(double: Variant, with_depth: bool) -> None:
         made = Splats2D.pack(
             columns[:, 0:2], columns[:, 2:5], columns[:, 5], columns[:, 6], columns[:, 7:]
         )
-        image, alpha, depth = double.ops.rasterize(made, 5, 4, background, with_depth=with_depth)
-        return (image, alpha) if depth is None else (image, alpha, depth)
+        image, alpha, depth = double.ops.rasterize(
+            made, 5, 4, background, with_depth=with_depth, additive=additive
+        )
+        outputs = (image, depth) if additive else (image, alpha, depth)
+        return tuple(values for values in outputs if values is not None)
 
     check_gradients(double, outputs, (columns, background))
 
@@ -853,25 +857,6 @@ def test_additive_splats_are_not_limited(variant: Variant) -> None:
     image.sum().backward()
     assert splats.packed.grad is not None
     assert_close(splats.packed.grad[:, 5], torch.full((5,), 6.0), 1e-5)
-
-
-@pytest.mark.parametrize("with_depth", [False, True])
-def test_additive_finite_differences(double: Variant, with_depth: bool) -> None:
-    with torch.no_grad():
-        splats = smooth_scene().project(reference)
-    background = uniform(generator(4), 0, 1, 3).requires_grad_()
-    columns = differentiable_columns(splats).requires_grad_()
-
-    def outputs(columns: Tensor, background: Tensor) -> tuple[Tensor, ...]:
-        made = Splats2D.pack(
-            columns[:, 0:2], columns[:, 2:5], columns[:, 5], columns[:, 6], columns[:, 7:]
-        )
-        image, _, depth = double.ops.rasterize(
-            made, 5, 4, background, with_depth=with_depth, additive=True
-        )
-        return (image,) if depth is None else (image, depth)
-
-    check_gradients(double, outputs, (columns, background))
 
 
 @pytest.mark.parametrize(

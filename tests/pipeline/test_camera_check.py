@@ -11,7 +11,7 @@ import pytest
 
 from snowsplat.cli.main import parse
 from snowsplat.data import load_dataset, read_dataset
-from snowsplat.data.judge.finding import Finding
+from snowsplat.data.judge.lens_check import Finding
 from snowsplat.pipeline.describe import describe
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run import dataset_check

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from snowsplat.data.lens.brown import as_colmap
-from snowsplat.data.lens.models import lens_of
+from snowsplat.data.lens.models import as_colmap, lens_of
 from snowsplat.data.lens.views import pinhole_view
 
 INTRINSICS = 900.0, 905.0, 655.0, 470.0

@@ -12,21 +12,7 @@ from snowsplat.data.lens.positions import Positions
 from snowsplat.data.lens.resample import resample, undistort_image, undistort_mask
 from snowsplat.data.lens.views import LensView, pinhole_view
 
-LENSES = {
-    "pincushion": ("SIMPLE_RADIAL", [260.0, 160.0, 120.0, 0.15]),
-    "barrel": ("SIMPLE_RADIAL", [260.0, 158.3, 121.6, -0.2]),
-    "tangential": ("OPENCV", [262.0, 258.0, 165.0, 117.0, -0.12, 0.05, 0.003, -0.004]),
-    "fisheye": ("OPENCV_FISHEYE", [150.0, 150.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0]),
-}
-
-
-def pinhole_of(camera: pycolmap.Camera) -> LensView:
-    size = camera.width, camera.height
-    return pinhole_view(lens_of(camera.model_name, *size, tuple(camera.params)))
-
-
-def lens(model: str, params: list[float], width: int = 320, height: int = 240) -> pycolmap.Camera:
-    return pycolmap.Camera(model=model, width=width, height=height, params=params)
+from .test_pinhole import LENSES, lens, pinhole_of
 
 
 def as_camera(pinhole: LensView) -> pycolmap.Camera:

@@ -5,7 +5,9 @@ import struct
 
 import pytest
 from PIL import Image
+from PIL.ExifTags import Base
 from PIL.PngImagePlugin import PngInfo
+from pillow_heif import register_heif_opener
 
 from snowsplat.data.photos import image_file
 from snowsplat.data.photos.decode import ImageSource, load_image, read_header
@@ -122,16 +124,34 @@ def test_bytes_before_the_pixels_of_a_jpeg(tmp_path, monkeypatch):
         read_header(path)
 
 
-def test_a_jpeg_beyond_the_limit_is_decoded_at_half_its_size(tmp_path, monkeypatch):
-    """As phones take with 200 million pixels; other formats cannot be decoded so."""
+@pytest.mark.parametrize("suffix", [".jpg", ".heic", ".avif"])
+def test_a_photo_beyond_the_limit_is_decoded_at_half_its_size(tmp_path, monkeypatch, suffix):
+    """As phones take with 200 million pixels; other formats are refused."""
     monkeypatch.setattr(image_file, "MOST_PIXELS", 3000)
-    monkeypatch.setattr(image_file, "_MOST_JPEG_PIXELS", 12_000)
-    for name in ("a.jpg", "a.png"):
-        Image.new("RGB", (96, 64), (200, 30, 30)).save(tmp_path / name)
-    with image_file.open_image(tmp_path / "a.jpg", ("JPEG",)) as image:
-        assert image.size == (48, 32)
-        assert image.convert("RGB").getpixel((3, 3))[0] > 150
-    Image.new("RGB", (120, 120)).save(tmp_path / "b.jpg")
-    for name in ("a.png", "b.jpg"):
+    most = dict.fromkeys(("JPEG", "HEIF", "AVIF"), 97 * 65)
+    monkeypatch.setattr(image_file, "_MOST_PIXELS", most)
+    photo = Image.new("RGB", (97, 65), (200, 30, 30))
+    register_heif_opener()
+    exif = Image.Exif()
+    exif[Base.Make] = "a maker"
+    for name in ("a.png", f"a{suffix}"):
+        photo.save(tmp_path / name, exif=exif)
+    for header_only in (False, True):
+        with image_file.open_image(
+            tmp_path / f"a{suffix}", ("JPEG", "HEIF", "AVIF"), header_only=header_only
+        ) as image:
+            assert image.size == (49, 33)
+            assert image.getexif()[Base.Make] == "a maker"
+            if not header_only:
+                assert image.format == {".heic": "HEIF"}.get(suffix, Image.EXTENSION[suffix])
+                assert image.convert("RGB").getpixel((3, 3))[0] > 150
+    photo.resize((98, 65)).save(tmp_path / f"b{suffix}")
+    for name in ("a.png", f"b{suffix}"):
         with pytest.raises(ValueError, match="million pixels"):
-            image_file.open_image(tmp_path / name, ("JPEG", "PNG"))
+            image_file.open_image(tmp_path / name, ("JPEG", "PNG", "HEIF", "AVIF"))
+
+
+def test_large_photos_of_phones_are_within_the_limits():
+    for format in ("JPEG", "MPO", "HEIF", "AVIF"):
+        assert image_file._MOST_PIXELS[format] >= 16_320 * 12_240
+    assert image_file._MOST_PIXELS["HEIF"] < 1.2 * image_file.MOST_PIXELS

@@ -14,6 +14,7 @@ from snowsplat.data import ImageLoader, ImageSource, View
 from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.views import lens_views
 from snowsplat.data.photos.decode import (
+    exif_exposure,
     load_image,
     load_mask,
     load_views,
@@ -26,6 +27,7 @@ from snowsplat.util.errors import UserError
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 POSE = torch.eye(4, dtype=torch.float64)[:3]
+TIME, STOP, ISO = 0x829A, 0x829D, 0x8827
 
 
 def make_view(path, pixels, mask=None, **save) -> View:
@@ -474,3 +476,27 @@ def test_available_memory_is_limited_by_the_control_group(monkeypatch, files, ex
     if not files:  # a system that reports nothing
         monkeypatch.delattr(os, "sysconf")
         assert available_memory() == 4 << 30
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "webp"])
+def test_more_light_is_a_larger_value(tmp_path, suffix):
+    def value(name, tags):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update(tags)
+        path = tmp_path / f"{name}.{suffix}"
+        Image.new("RGB", (8, 8)).save(path, exif=exif)
+        return exif_exposure(path)
+
+    usual = value("usual", {TIME: 0.01, STOP: 4.0, ISO: 100})
+    assert value("longer", {TIME: 0.02, STOP: 4.0, ISO: 100}) == pytest.approx(usual + 1)
+    assert value("wider", {TIME: 0.01, STOP: 2.0, ISO: 100}) == pytest.approx(usual + 2)
+    assert value("faster", {TIME: 0.01, STOP: 4.0, ISO: 400}) == pytest.approx(usual + 2)
+    assert value("no time", {STOP: 4.0, ISO: 100}) is None
+    assert value("no light", {TIME: 0.0, STOP: 4.0, ISO: 100}) is None
+
+
+def test_files_without_exposure(tmp_path):
+    Image.new("RGB", (8, 8)).save(tmp_path / "plain.png")
+    (tmp_path / "text.jpg").write_text("not a photo")
+    for name in ("plain.png", "text.jpg", "missing.jpg"):
+        assert exif_exposure(tmp_path / name) is None

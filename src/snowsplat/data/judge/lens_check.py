@@ -1,10 +1,10 @@
-"""`lens_findings`: whether the intrinsics of a pinhole camera are those of a real one."""
+"""`Finding`, what a check of cameras has found, and `lens_findings`: whether the intrinsics of a
+pinhole camera are those of a real one."""
 
 from __future__ import annotations
 
 import math
-
-from snowsplat.data.judge.finding import Finding
+from dataclasses import dataclass
 
 # Degrees, of the longer side of a photo. A pinhole image of more than 150° has less than a
 # seventh of its pixels within the central 60°: no lens is corrected to that. Below 5° (more than
@@ -18,6 +18,25 @@ _SQUARE = 0.97, 1.03
 # Distance of the principal point from the centre, relative to the size of the photo. Cropping
 # moves it.
 _OFF_CENTRE = 0.2
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check has found, for the user.
+
+    Attributes:
+        about: the quantity, in one or two words: "field of view", "axes".
+        text: one sentence with numbers, without a full stop. If ``impossible``, it also says what
+            to do, after a semicolon.
+        impossible: no real camera is like this, or the evidence is overwhelming. False: in doubt;
+            the data may be unusual but right.
+        photos: the views whose poses are wrong, if those of the others are right.
+    """
+
+    about: str
+    text: str
+    impossible: bool = False
+    photos: tuple[str, ...] = ()
 
 
 def field_of_view(size: float, focal: float) -> float:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snowsplat.data.dataset import Points, View
-from snowsplat.data.judge.finding import Finding
+from snowsplat.data.judge.lens_check import Finding
 from snowsplat.data.judge.rig import Rig
 from snowsplat.data.maps.mask_pixels import INVERT, doubt_about_masks, look_of
 from snowsplat.data.photos.decode import ImageSource, load_mask

@@ -28,8 +28,7 @@ import numpy as np
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.judge.colour_evidence import Agreement, ColourEvidence
-from snowsplat.data.judge.finding import Finding
-from snowsplat.data.judge.lens_check import lens_findings
+from snowsplat.data.judge.lens_check import Finding, lens_findings
 from snowsplat.data.judge.mask_check import mask_findings
 from snowsplat.data.judge.match_evidence import Fit, MatchEvidence, PhotoSample
 from snowsplat.data.judge.repairs import Repair, point_repairs, pose_repairs

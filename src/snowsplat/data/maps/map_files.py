@@ -249,8 +249,8 @@ def read_normal_file(path: Path) -> np.ndarray:
         finite = np.isfinite(scaled)
         # Normals of all directions towards a camera have negative components in any frame.
         normals = 2.0 * scaled - 1.0 if (scaled[finite] >= 0.0).all() else scaled
-    length = np.sqrt((normals * normals).sum(-1, keepdims=True))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
+        length = np.sqrt((normals * normals).sum(-1, keepdims=True))
         known = np.abs(length - 1.0) <= _LENGTH_ERROR
     marked = (scaled == 0.0).all(-1) | (scaled == 1.0).all(-1) | ~np.isfinite(length[..., 0])
     others = int((~known[..., 0] & ~marked).sum())

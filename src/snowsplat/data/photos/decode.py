@@ -6,6 +6,7 @@ on the files beside it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import torch
 from PIL import Image, ImageOps
-from PIL.ExifTags import Base
+from PIL.ExifTags import IFD, Base
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -33,6 +34,7 @@ from snowsplat.util.safe_json import is_file
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM", *OPTIONAL_FORMATS)
 # Pixels are converted in bands of this size, to limit the memory for temporary arrays.
 _BAND_PIXELS = 1 << 20
+_EXPOSURE = Base.ExposureTime, Base.FNumber, Base.ISOSpeedRatings
 # Samples per pixel along each axis when a view of a larger photo is scaled down.
 _SAMPLES = 2
 #: Suffixes that are tried if a dataset names its images without a suffix.
@@ -119,6 +121,26 @@ def read_header(path: Path) -> Header:
         has_exif = "exif" in image.info or image.format == "TIFF"
         orientation = image.getexif().get(Base.Orientation, 1) if has_exif else 1
         return Header(image.width, image.height, sideways=orientation in (5, 6, 7, 8))
+
+
+def exif_exposure(path: Path) -> float | None:
+    """How much light the sensor recorded of a given scene, in EV: log₂(t · ISO / N²).
+
+    One more means a photo of twice the brightness. The zero point is arbitrary.
+
+    Returns: None if exposure time t, f-number N or ISO is missing or not positive, or the file
+    cannot be read.
+    """
+    try:
+        with Image.open(path) as image:
+            # Without EXIF data before the pixels of a PNG, getexif() would decode them.
+            if "exif" not in image.info:
+                return None
+            details = image.getexif().get_ifd(IFD.Exif)
+        time, stop, iso = (float(details[tag]) for tag in _EXPOSURE)
+        return math.log2(time * iso / stop**2)
+    except Exception:  # Pillow raises many kinds of exceptions for damaged files
+        return None
 
 
 def load_image(source: ImageSource, background: Sequence[float] | None = None) -> Tensor:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -14,14 +16,20 @@ from snowsplat.util.errors import Problem, cause_of
 from snowsplat.util.files import GIT_LFS
 from snowsplat.util.messages import Message, message
 
+logger = logging.getLogger(__name__)
+
 #: Formats that depend on how Pillow was built.
 OPTIONAL_FORMATS = ("AVIF",) if features.check("avif") else ()
 #: The largest number of pixels of an image: Pillow's own limit. The largest camera backs have 151
-#: million. The size is known before the image is decoded. A JPEG of up to four times as many, as
-#: phones take with 200 million, is decoded at half its size.
+#: million. The size is known before the image is decoded. Phones take 200 million: a JPEG of up to
+#: four times as many is decoded at half its size; HEIC and AVIF, whose decoders cannot do that, are
+#: decoded whole, one at a time, and halved at once.
 MOST_PIXELS = 178_956_970
-_MOST_JPEG_PIXELS = 4 * MOST_PIXELS
-Image.MAX_IMAGE_PIXELS = _MOST_JPEG_PIXELS // 2  # Pillow refuses twice as many
+_MOST_PIXELS = dict.fromkeys(("JPEG", "MPO"), 4 * MOST_PIXELS)
+_MOST_PIXELS |= dict.fromkeys(("HEIF", "AVIF"), 205_000_000)
+Image.MAX_IMAGE_PIXELS = 2 * MOST_PIXELS  # Pillow refuses twice as many
+_HEIF_BYTES = 9  # memory per pixel while HEIC (7) or AVIF is decoded whole
+_one_whole = threading.Lock()
 #: The largest width or height: that of the JPEG format.
 LONGEST_SIDE = 65_535
 #: The reason in the error for a larger image.
@@ -70,7 +78,8 @@ def open_image(
         page: which page of a file with several, from 0.
 
     Raises:
-        ValueError: larger than `MOST_PIXELS` (a JPEG: four times) or `LONGEST_SIDE`, or malicious.
+        ValueError: larger than `MOST_PIXELS` (JPEG, HEIC, AVIF: see there) or `LONGEST_SIDE`, or
+            malicious.
         Exception: anything that Pillow raises for a damaged file.
     """
     with open(path, "rb") as file:
@@ -87,10 +96,26 @@ def open_image(
                 whole.draft(None, (1, 1))
                 whole.load()
         if image.width * image.height > MOST_PIXELS:
-            image.draft(None, (image.width // 2, image.height // 2))
+            image = _halved(image, path, header_only)
     except BaseException:
         image.close()
         raise
+    return image
+
+
+def _halved(image: Image.Image, path: Path, header_only: bool) -> Image.Image:
+    width, height = image.size
+    if image.format in ("JPEG", "MPO"):
+        image.draft(None, (width // 2, height // 2))
+    elif header_only:
+        image._size = -(-width // 2), -(-height // 2)  # as `reduce` rounds
+    else:
+        with _one_whole, image:
+            gigabytes = _HEIF_BYTES * width * height / 1e9
+            logger.info("%s: is decoded whole and halved: %.1f GB of memory", path, gigabytes)
+            half = image.reduce(2)
+        half.format = image.format
+        return half
     return image
 
 
@@ -141,7 +166,7 @@ def _check_header(file: BinaryIO) -> bool:
 def _check_size(image: Image.Image, size: int) -> None:
     """``size``: of the file in bytes."""
     width, height = image.size
-    most = _MOST_JPEG_PIXELS if image.format in ("JPEG", "MPO") else MOST_PIXELS
+    most = _MOST_PIXELS.get(image.format or "", MOST_PIXELS)
     if width * height > most or max(width, height) > LONGEST_SIDE:
         raise Problem(TOO_LARGE)
     # Pillow's decoders in Python take a second per million pixels, and one of them does not check

@@ -26,8 +26,7 @@ from snowsplat._version import __version__
 from snowsplat.data import read_files, read_undamaged
 from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.dataset import Points, PosedImage
-from snowsplat.data.lens.brown import as_colmap
-from snowsplat.data.lens.models import pinhole_of
+from snowsplat.data.lens.models import as_colmap, pinhole_of
 from snowsplat.pipeline.blocks.content import Axes, Cell, block_content
 from snowsplat.pipeline.options.benchmark import PlanOptions
 from snowsplat.pipeline.options.train import TrainOptions

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, View
-from snowsplat.data.photos.exif_exposure import exif_exposure
+from snowsplat.data.photos.decode import exif_exposure
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.point_colors import point_colors, point_pixels

@@ -20,8 +20,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snowsplat.data.judge.finding import Finding
-from snowsplat.data.judge.lens_check import lens_findings
+from snowsplat.data.judge.lens_check import Finding, lens_findings
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.ingest.photo import Photo
 
