@@ -334,20 +334,6 @@ def test_invalid_settings(options, message, tmp_path):
         gathered(write_photos(tmp_path / "p"), tmp_path / "out", **options)
 
 
-def test_not_enough_disk_space(tmp_path, monkeypatch):
-    root = write_photos(tmp_path / "p", 3, "webp")
-    path = write_video(tmp_path / "a.mp4", pan(9))
-    monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage)
-    for source in (root, path):
-        with pytest.raises(UserError, match=r"about \d+ MB are needed and \d+ MB are free"):
-            gathered(source, tmp_path / "out")
-        assert files(tmp_path / "out") == []
-
-
-class _Usage:
-    free = 1000
-
-
 @pytest.mark.parametrize("writes", ["photos", "video"])
 def test_the_disk_becomes_full(writes, tmp_path, monkeypatch):
     def full(*_, **__):

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import math
-import shutil
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -89,8 +87,8 @@ def gather(
         inputs: photos, folders and videos, or what `find_sources` has found in them.
 
     Raises:
-        UserError: fewer than three usable photos, a mask whose size differs from its photo, not
-            enough disk space, or photos used in place that would have to be changed.
+        UserError: fewer than three usable photos, a mask whose size differs from its photo, a full
+            disk, or photos used in place that would have to be changed.
         OSError: the dataset cannot be written.
     """
     if options.fps is not None and options.frames is not None:
@@ -108,7 +106,6 @@ def gather(
         _refuse_changes(planned, sources.videos, options)
     folder.mkdir(parents=True, exist_ok=True)
     notes: list[str] = []
-    _check_disk_space(dataset, planned, clips, options)
     try:
         photos, looks = write_photos(planned, dataset, options.size, in_place, left_out, report)
         photos = _with_panoramas(photos)
@@ -224,35 +221,6 @@ def _take_frames(
 
 
 # Errors
-
-
-def _check_disk_space(
-    dataset: Path,
-    planned: Sequence[Planned],
-    clips: Sequence[tuple[Source, Clip]],
-    options: GatherOptions,
-) -> None:
-    """Raises UserError if ``input/`` certainly does not fit on the disk (by a low estimate)."""
-    device = DatasetFolder(dataset).photos.stat().st_dev
-    needed = 0.0
-    for plan in planned:
-        width, height = plan.header.size(options.size)
-        if not plan.header.is_ready(options.size):
-            needed += width * height * (0.6 if plan.name.lower().endswith("g") else 1.5)
-        elif plan.source.path.stat().st_dev != device:
-            needed += plan.source.path.stat().st_size
-    for _, clip in clips:
-        scale = min(1.0, (options.size or math.inf) / max(clip.width, clip.height))
-        pixels = clip.width * clip.height * scale**2
-        needed += 0.3 * pixels * max_frame_count(clip, options.fps, options.frames)
-    free = shutil.disk_usage(dataset).free
-    if needed > free:
-        raise UserError(
-            "disk: about {needed:,.0f} MB are needed and {free:,.0f} MB are free; free some "
-            "space, or set a smaller size, e.g. 1600",
-            needed=needed / 1000000.0,
-            free=free / 1000000.0,
-        )
 
 
 def _too_few(usable: int, left_out: Sequence[LeftOut]) -> UserError:

@@ -1,7 +1,7 @@
 """Unpacks zip files of photos and videos, as cloud services and apps of phones give them.
 
 A zip file may come from a stranger. Nothing is written outside of the new folder, links are not
-created, and the unpacked size is bounded by the size of the file and by the free disk space.
+created, and the unpacked size is bounded by the size of the file.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def unpack(path: Path) -> Path:
     called ``NAME_unpacked``.
 
     Raises: UserError: the file is damaged, empty or has a password; a file in it has a path outside
-    of the folder; it needs more disk space than there is; or the folder cannot be written.
+    of the folder; or the folder cannot be written.
     """
     with _open_zip(path) as archive:
         entries = _check_entries(archive, path)
@@ -172,15 +172,6 @@ def _has_all(folder: Path, entries: Sequence[tuple[str, zipfile.ZipInfo]]) -> bo
 def _extract_all(
     archive: zipfile.ZipFile, entries: Sequence[tuple[str, zipfile.ZipInfo]], folder: Path
 ) -> None:
-    size = sum(info.file_size for _, info in entries)
-    if size > (free := shutil.disk_usage(folder.parent).free):
-        raise UserError(
-            "disk: about {size:,.0f} MB are needed to unpack {name}.zip and {free:,.0f} MB are "
-            "free; free some space",
-            size=size / 1000000.0,
-            name=shown(folder.name),
-            free=free / 1000000.0,
-        )
     with new_entries(folder.parent, [folder.name]) as new:
         for name, info in entries:
             target = new / folder.name / name
