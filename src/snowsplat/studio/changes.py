@@ -23,14 +23,16 @@ from snowsplat.pipeline.edit import (
     undo_edits,
     write_keys,
 )
+from snowsplat.pipeline.mesh import write_mesh
 from snowsplat.pipeline.options.scene import PublishOptions
+from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.publish import PublishResult, publish
 from snowsplat.project.edit_record import PageEdit, edited_file
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project
 from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
-from snowsplat.studio.hand_on import export_file, is_exported
+from snowsplat.studio.hand_on import SURFACES, export_file, is_exported
 from snowsplat.studio.job import is_being_made
 from snowsplat.studio.library import safe_title
 from snowsplat.util.errors import UserError
@@ -84,6 +86,10 @@ def export(scene: StudioScene, settings: Export) -> dict[str, Any]:
         if kind == "zip":
             with new_entries(target.parent, [target.name]) as new:
                 shutil.make_archive(str(new / target.stem), "zip", scene.site)
+        elif kind in SURFACES:
+            write_mesh(
+                lambda: load_trained(scene.made), target, overwrite=True, points=kind == "points"
+            )
         else:
             convert(file, target, overwrite=True)
         os.utime(target, ns=(time, time))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.pipeline.options.video import VideoOptions
 from snowsplat.project.page_film import PageFilm
+from snowsplat.project.project import Project
 from snowsplat.project.studio_scene import Job, StudioScene
 from snowsplat.studio.library import safe_name
 from snowsplat.util.flags import command_line, words
@@ -18,9 +20,22 @@ FORMATS = {
     "spz": ".spz",
     "sog": ".sog",
     "glb": ".glb",
+    "usdz": ".usdz",
     "html": ".html",
     "zip": ".zip",
+    "mesh": "_mesh.glb",
+    "points": "_points.ply",
 }
+#: Kinds that are made from the photos of a training, without the edits of the scene.
+SURFACES = ("mesh", "points")
+
+
+def formats_of(scene: StudioScene) -> list[str]:
+    """The kinds of `FORMATS` that a scene can be written in."""
+    missing = [] if find_spec("pxr") else ["usdz"]  # an optional package
+    if Project.open(scene.made).training is None:
+        missing += SURFACES
+    return [kind for kind in FORMATS if kind not in missing]
 
 
 def export_file(scene: StudioScene, kind: str) -> Path:
@@ -43,6 +58,8 @@ def export_command(scene: StudioScene, kind: str) -> str:
     file = scene.scene_file() or scene.made
     if kind == "zip":
         return command_line("publish", [file, "-o", "site"])
+    if kind in SURFACES:
+        return command_line(kind, [scene.made, "-o", export_file(scene, kind).name])
     return command_line("convert", [file, export_file(scene, kind).name])
 
 

@@ -16,7 +16,7 @@ from snowsplat.project.project import Project
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio import job
 from snowsplat.studio.given_photos import leave_out
-from snowsplat.studio.hand_on import FORMATS, export_command, make_command
+from snowsplat.studio.hand_on import export_command, formats_of, make_command
 from snowsplat.studio.library import safe_title
 from snowsplat.studio.picture_requests import picture_of
 from snowsplat.studio.requests import (
@@ -187,7 +187,7 @@ def details(scene: StudioScene) -> dict[str, Any]:
         "film": scene.film.stat().st_mtime if is_file(scene.film) else 0,
         "map": scene.map.stat().st_mtime if is_file(scene.map) else 0,
         "command": make_command(scene, made),
-        "exports": {kind: export_command(scene, kind) for kind in FORMATS},
+        "exports": {kind: export_command(scene, kind) for kind in formats_of(scene)},
     }
 
 
