@@ -104,29 +104,29 @@ def test_photos_with_too_few_points_have_no_gain():
 
 
 def points_start(logs: Tensor, xyz: Tensor, monkeypatch) -> module.ExposureStart:
-    """The exposures of photos with these colours (V, P, 3) of points (P, 3)."""
+    """The exposures of photos with these colours (V, P, 3) of points (P, 3), two at each place."""
     monkeypatch.setattr(module, "_log_colors", lambda views, points, step, images: logs)
-    views = [SimpleNamespace(image=SimpleNamespace(path=Path("no photo")))] * len(logs)
-    return exposure_start(
-        SimpleNamespace(train=views, points=Points(xyz, torch.zeros(len(xyz), 3))), None
-    )
+    pairs = [[i - len(logs) // 2] for i in range(len(logs))]
+    monkeypatch.setattr(module, "source_views", lambda cameras, points, count: pairs)
+    views = [SimpleNamespace(image=SimpleNamespace(path=Path("no photo")), camera=None)] * len(logs)
+    dataset = SimpleNamespace(train=views, points=Points(xyz, torch.zeros(len(xyz), 3)))
+    return exposure_start(dataset, None)
 
 
 @pytest.mark.parametrize(
-    ("everywhere", "on_sides", "same"),
-    [(0.2, 0.0, True), (0.2, 0.05, True), (0.2, 0.2, False), (0.0, 0.2, False), (0.0, 0.0, False)],
+    ("everywhere", "on_sides", "jump", "same"),
+    [(0.2, 0.05, 0.0, True), (0.2, 0.2, 0.0, False), (0.2, 0.2, 0.2, True), (0.0, 0.2, 0.0, False)],
 )
-def test_shiny_surfaces_are_no_exposure(everywhere, on_sides, same, monkeypatch):
-    """Photos are brighter in all parts of the scene, and differ on its two sides, as on a table
-    that reflects a window and a wall.
-    """
+def test_shiny_surfaces_are_no_exposure(everywhere, on_sides, jump, same, monkeypatch):
+    """Photos are brighter, differ on two sides of the scene, as on a table that reflects a window
+    and a wall, and two photos from a place differ by twice ``jump``."""
     generator = torch.Generator().manual_seed(0)
     xyz = torch.rand(1000, 3, generator=generator)
     noise = 0.05 * torch.randn(12, 1000, 3, generator=generator, dtype=torch.float64)
     logs = torch.rand(1000, 3, generator=generator, dtype=torch.float64) - 1.5 + noise
-    brighter = torch.randn(2, 12, 1, 1, generator=generator, dtype=torch.float64)
-    logs = logs + everywhere * brighter[0]
-    logs += on_sides * brighter[1] * torch.where(xyz[:, :1] < 0.5, 1.0, -1.0)
+    brighter = torch.randn(2, 6, 1, 1, generator=generator, dtype=torch.float64).repeat(1, 2, 1, 1)
+    logs += everywhere * brighter[0] + on_sides * brighter[1] * (2.0 * (xyz[:, :1] < 0.5) - 1.0)
+    logs += torch.tensor([jump, -jump]).repeat_interleave(6)[:, None, None]
     start = points_start(logs, xyz, monkeypatch)
     assert start.everywhere == same
     assert start.spread > 0.05 or not everywhere

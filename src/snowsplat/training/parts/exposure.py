@@ -18,7 +18,6 @@ Where a photo is overexposed, it only says that the image is at least as bright;
 
 from __future__ import annotations
 
-import math
 from statistics import pstdev
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
@@ -30,7 +29,7 @@ from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.evaluation.verdict import Reason
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.parts.exposed_image import ExposedImages
-from snowsplat.training.parts.exposure_start import GAMMA, ExposureStart, exposure_start
+from snowsplat.training.parts.exposure_start import LOG_EV, ExposureStart, exposure_start
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
 from snowsplat.training.parts.part import Part, PartReport, Section
 from snowsplat.training.step.batch import Batch, BatchView
@@ -100,7 +99,7 @@ class Exposure(Part):
 
         ``ev``: (N, 3) in EV, see `ev`.
         """
-        known = (math.log(2.0) / GAMMA * ev).to(self.log_gains)
+        known = (LOG_EV * ev).to(self.log_gains)
         self.log_gains += (known - self.log_gains[: len(known)]).mean(0)
         self.log_gains[: len(known)] = known
         self._middle = self.log_gains.mean(0)
@@ -109,7 +108,7 @@ class Exposure(Part):
     def ev(self) -> Tensor:
         """(V, 3) on the CPU: the exposures in EV, relative to their mean; no rows if not learnt."""
         rows = self.log_gains if self.active else self.log_gains[:0]
-        return GAMMA / math.log(2.0) * rows.cpu()
+        return rows.cpu() / LOG_EV
 
     def background(self, run: Run, view: BatchView, color: Tensor) -> Tensor:
         """The colour (3,) that becomes ``color`` when it is exposed."""

@@ -17,7 +17,8 @@ of the exposures.
 Shiny surfaces and the light of a window are brighter from some places, too. But such differences
 are others in other parts of the scene. So the scene is divided into octants. What is left of the
 colours of an octant without the gains, as a median for each photo, must vary much less than the
-gains. Again, this variance is the covariance of two halves.
+gains. Again, this variance is the covariance of two halves. Or the gains differ much between photos
+from about the same place, where surfaces shine alike.
 """
 
 from __future__ import annotations
@@ -34,11 +35,14 @@ from snowsplat.data.photos.decode import exif_exposure
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.point_colors import point_colors, point_pixels
+from snowsplat.training.starts.source_views import source_views
 from snowsplat.util.messages import Message, message
 from snowsplat.util.process import single_threaded
 
 #: Photos are encoded approximately by this power: value = light^(1 / 2.2).
 GAMMA = 2.2
+#: The log-gain of encoded values for one EV.
+LOG_EV = math.log(2.0) / GAMMA
 #: The colours of at least this number of points are compared, and of this number for each photo, as
 #: a photo shows few of the points of a large scene; but there are at most so many colours in all.
 _SAMPLE, _SAMPLE_OF_PHOTO, _MOST_COLORS = 1000, 20, 2_000_000
@@ -61,9 +65,11 @@ _LEAST_SHARE, _ENOUGH = 0.7, 20
 #: The variance of what is left in the octants, relative to that of the gains, is at most this. In
 #: photos where gains help it is 0.0 to 0.17, in photos with fixed exposure or gloss 0.34 to 15.
 _MOST_LEFT = 0.25
-#: The scene is divided along so many frames of axes, half of an octant has so many colours in a
-#: photo, and this share of the products of the medians of two halves is ignored at either end.
-_FRAMES, _LEAST_COLORS, _TRIMMED = 6, 8, 0.05
+#: Differences between photos from about the same place, in EV. With gloss they are 0.05 to 0.23.
+_LEAST_JUMPS = 0.25
+#: Half of an octant has about so many colours in a photo, or more. This share of the products of
+#: the medians of two halves is ignored at either end.
+_LEAST_COLORS, _TRIMMED = 8, 0.05
 
 
 @dataclass(frozen=True)
@@ -100,22 +106,25 @@ def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
         most = min(_SAMPLE_OF_PHOTO * len(views), _MOST_COLORS // len(views))
         step = -(-len(xyz) // max(_SAMPLE, most))
         logs = _log_colors(views, xyz, step, images)
-        products = log_gains(logs[:, ::2]) * log_gains(logs[:, 1::2])
+        one, other = log_gains(logs[:, ::2]), log_gains(logs[:, 1::2])
+        products = one * other
         if int(products.isfinite().sum()) > 3 * min(_LEAST_SHARE * len(views), _ENOUGH):
             whole, variance = log_gains(logs), max(0.0, float(products.nanmean()))
             left = variance_left(logs - whole[:, None], xyz[::step].to(logs.device))
+            sample = xyz[:: -(-len(xyz) // _SAMPLE)].to(logs.device)
+            sources = source_views([view.camera for view in views], sample, 1)
+            near = [found[0] if found else i for i, found in enumerate(sources)]
+            jumps = 0.5 * float(((one - one[near]) * (other - other[near])).nanmean())
+            everywhere = left <= _MOST_LEFT * variance or jumps >= (_LEAST_JUMPS * LOG_EV) ** 2
             gains = (whole - whole.nanmean(0)).nan_to_num().to("cpu", torch.float32)
-            spread = GAMMA / math.log(2.0) * math.sqrt(variance)
-            return ExposureStart(gains, spread, message("points"), left <= _MOST_LEFT * variance)
-    values = [exif_exposure(view.image.path) for view in views]
-    known = [value for value in values if value is not None]
+            return ExposureStart(gains, math.sqrt(variance) / LOG_EV, message("points"), everywhere)
+    exposures = [exif_exposure(view.image.path) for view in views]
+    known = [exposure for exposure in exposures if exposure is not None]
     if len(views) > 1 and len(known) == len(views):
         ev = torch.tensor(known, dtype=torch.float64)
         ev -= ev.mean()
-        gains = (ev * math.log(2.0) / GAMMA)[:, None].expand(-1, 3)
-        return ExposureStart(
-            gains.to(torch.float32), float(ev.square().mean().sqrt()), message("EXIF data")
-        )
+        gains = (ev * LOG_EV).to(torch.float32)[:, None].expand(-1, 3)
+        return ExposureStart(gains, float(ev.square().mean().sqrt()), message("EXIF data"))
     return ExposureStart(torch.zeros(len(views), 3), None)
 
 
@@ -159,25 +168,16 @@ def variance_left(logs: Tensor, xyz: Tensor) -> float:
     # The median of two colours is one of them, so it would not differ.
     logs = torch.where(logs.isfinite().sum(0) >= 3, logs, torch.nan)
     rest = logs - logs.nanmedian(0).values
-    generator, found = torch.Generator().manual_seed(0), [logs.new_zeros(0)]
-    for _ in range(_FRAMES):
-        axes = torch.linalg.qr(torch.randn(3, 3, generator=generator))[0]
-        along = xyz @ axes.to(xyz)
-        octant = ((along > along.median(0).values) * along.new_tensor([1, 2, 4])).sum(1)
-        for number in range(8):
-            part = rest[:, octant == number]
-            if part.shape[1] >= 2 * _LEAST_COLORS:
-                found.append((_medians(part[:, ::2]) * _medians(part[:, 1::2])).flatten())
+    octant = ((xyz > xyz.median(0).values) * xyz.new_tensor([1, 2, 4])).sum(1)
+    found = [logs.new_zeros(0)]
+    for part in (rest[:, octant == number] for number in range(8)):
+        if part.shape[1] >= 2 * _LEAST_COLORS:
+            product = part[:, ::2].nanmedian(1).values * part[:, 1::2].nanmedian(1).values
+            found.append(product[part.isfinite().sum(1) >= 2 * _LEAST_COLORS])
     products = torch.cat(found)
     products = products[products.isfinite()].sort().values
     few = int(_TRIMMED * len(products))
     return float(products[few : len(products) - few].mean())
-
-
-def _medians(colors: Tensor) -> Tensor:
-    """(V, 3): the medians over the points of colours (V, P, 3); NaN where too few are known."""
-    enough = colors.isfinite().sum(1) >= _LEAST_COLORS
-    return torch.where(enough, colors.nanmedian(1).values, torch.nan)
 
 
 def log_gains(logs: Tensor) -> Tensor:
