@@ -129,7 +129,6 @@ def test_shiny_surfaces_are_no_exposure(everywhere, on_sides, jump, same, monkey
     logs += torch.tensor([jump, -jump]).repeat_interleave(6)[:, None, None]
     start = points_start(logs, xyz, monkeypatch)
     assert start.everywhere == same
-    assert start.spread > 0.05 or not everywhere
 
 
 def test_the_exposures_of_a_dataset(clean, degraded, gains):
@@ -152,7 +151,6 @@ def test_photos_that_show_few_points_do_not_hide_the_exposures_of_others(
     logs = torch.full((60, 1000, 3), torch.nan, dtype=torch.float64)
     logs[:known] = -1.0 + true[:, None]
     logs[:known] += 0.02 * torch.randn(logs[:known].shape, generator=generator)
-    monkeypatch.setattr(module, "exif_exposure", lambda path: None)
     start = points_start(logs, xyz, monkeypatch)
     assert (start.spread is not None) == enough
     if enough:
