@@ -127,8 +127,7 @@ def test_shiny_surfaces_are_no_exposure(everywhere, on_sides, jump, same, monkey
     brighter = torch.randn(2, 6, 1, 1, generator=generator, dtype=torch.float64).repeat(1, 2, 1, 1)
     logs += everywhere * brighter[0] + on_sides * brighter[1] * (2.0 * (xyz[:, :1] < 0.5) - 1.0)
     logs += torch.tensor([jump, -jump]).repeat_interleave(6)[:, None, None]
-    start = points_start(logs, xyz, monkeypatch)
-    assert start.everywhere == same
+    assert points_start(logs, xyz, monkeypatch).everywhere == same
 
 
 def test_the_exposures_of_a_dataset(clean, degraded, gains):
