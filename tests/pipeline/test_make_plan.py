@@ -2,7 +2,13 @@
 
 import pytest
 
-from snowsplat.pipeline.make_plan import MakePlan, choose_plan, described
+from snowsplat.pipeline.make_plan import (
+    MakePlan,
+    choose_plan,
+    described,
+    expected,
+    expected_seconds,
+)
 from snowsplat.sfm.cost import Photos, Speed, steps_of
 
 FAST = Speed(0.1, 16)
@@ -92,3 +98,12 @@ def test_the_description_names_what_was_chosen():
     assert str(described(MakePlan("best", 3200), of_photos(40, 3000), 3600)) == (
         "1 h 0 min: 40 photos, 3000 pixels, best effort"
     )
+
+
+def test_what_is_expected_in_one_line():
+    """Given poses leave only the training; a slower machine needs the longer time."""
+    found = of_photos(36)
+    seconds = expected_seconds("draft", found, HERE)
+    assert str(expected("draft", found, 180.0)) == "36 photos, draft: about 3 min 0 s"
+    assert expected_seconds("draft", found, HERE, poses=False) < seconds
+    assert expected_seconds("draft", found, Speed(2.0, 2)) == pytest.approx(2 * seconds)

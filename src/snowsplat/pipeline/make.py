@@ -17,7 +17,15 @@ from typing import Any
 from snowsplat import ops
 from snowsplat.data import Dataset, read_dataset
 from snowsplat.pipeline.all_photos import SHARE, train_on_all
-from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described, given_poses
+from snowsplat.pipeline.make_plan import (
+    POSES_SHARE,
+    MakePlan,
+    choose_plan,
+    described,
+    expected,
+    expected_seconds,
+    given_poses,
+)
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.make import PRESETS, MakeOptions, Preset
 from snowsplat.pipeline.options.train import TrainOptions
@@ -253,6 +261,11 @@ class _Job:
         quality, minutes = self.options.quality, self.options.minutes
         if minutes is None or self.given is not None:
             quality = quality or "normal"
+            if minutes is None and "title" not in self.stages.about and self._on_cpu():
+                photos = survey(self.sources)
+                speed = measure_speed(self.options.compute.threads or ops.get_num_threads())
+                seconds = expected_seconds(quality, photos, speed, self.given is None)
+                self.observer.note(expected(quality, photos, seconds))
             return MakePlan(quality, PRESETS[quality].photos)
         photos = survey(self.sources)
         about = {"minutes": minutes, "quality": quality, "photos": asdict(photos)}
@@ -288,9 +301,12 @@ class _Job:
         """The work after the dataset is made, for the estimate of the time left."""
         if self.options.minutes is not None:
             return Later(deadline=self.started + 60.0 * self.options.minutes)
-        if ops.resolve_device(self.options.compute.device).type != "cpu":
+        if not self._on_cpu():
             return Later()  # on a GPU, the training takes a small part of the time
         return Later(work=PRESETS[plan.quality].training)
+
+    def _on_cpu(self) -> bool:
+        return ops.resolve_device(self.options.compute.device).type == "cpu"
 
     def _make_scene(self, plan: MakePlan) -> tuple[Figures, LastPart]:
         settings: dict[str, Any] = (

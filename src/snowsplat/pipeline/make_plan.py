@@ -33,7 +33,7 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.make import PRESETS, Quality
 from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.sfm.colmap.options import EFFORTS
-from snowsplat.sfm.cost import Photos, Speed, predicted_seconds
+from snowsplat.sfm.cost import Photos, Speed, Step, predicted_seconds
 from snowsplat.sfm.ingest.search.sources import Source, Sources
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
@@ -106,6 +106,35 @@ def _thinned(photos: Photos, count: int) -> Photos:
 
 def described(plan: MakePlan, photos: Photos, seconds: float) -> Message:
     """The plan in one line, such as "3 min 0 s: 60 of 300 photos, 1000 pixels, draft effort"."""
+    return message(
+        "{time}: {photos}, {size} pixels, {quality} effort",
+        time=duration(seconds),
+        photos=_counted(plan, photos),
+        size=min(plan.size, max(photos.longest, photos.video)),
+        quality=plan.quality,
+    )
+
+
+def expected(quality: Quality, photos: Photos, seconds: float) -> Message:
+    """What `make` begins, and how long it takes, in one line: "36 photos, draft: about 3 min"."""
+    plan = MakePlan(quality, PRESETS[quality].photos)
+    return message(
+        "{photos}, {quality}: about {time}",
+        photos=_counted(plan, photos),
+        quality=quality,
+        time=duration(seconds),
+    )
+
+
+def expected_seconds(quality: Quality, photos: Photos, speed: Speed, poses: bool = True) -> float:
+    """The predicted time of `make` on the CPU; ``poses``: whether they are estimated."""
+    preset = PRESETS[quality]
+    training = Step(preset.training).seconds(speed)
+    before = predicted_seconds(photos, preset.photos, quality, speed) if poses else 0.0
+    return before + training
+
+
+def _counted(plan: MakePlan, photos: Photos) -> Message:
     stills = message("{photos} photos", photos=photos.stills)
     if plan.photos is not None:
         stills = message("{used} of {all} photos", used=plan.photos, all=photos.stills)
@@ -114,13 +143,7 @@ def described(plan: MakePlan, photos: Photos, seconds: float) -> Message:
         used = plan.frames * photos.videos
         frames = message("{used} of {all} frames", used=used, all=photos.frames)
     both = message("{photos} and {frames}", photos=stills, frames=frames)
-    return message(
-        "{time}: {photos}, {size} pixels, {quality} effort",
-        time=duration(seconds),
-        photos=both if photos.stills and photos.frames else stills if photos.stills else frames,
-        size=min(plan.size, max(photos.longest, photos.video)),
-        quality=plan.quality,
-    )
+    return both if photos.stills and photos.frames else stills if photos.stills else frames
 
 
 def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer) -> Dataset | None:

@@ -25,6 +25,7 @@ from snowsplat.pipeline.demo import take_demo_photos
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.edit import film, film_preview
 from snowsplat.pipeline.make import make
+from snowsplat.pipeline.make_plan import expected_seconds
 from snowsplat.pipeline.options.make import PRESETS, MakeOptions
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.results import MakeResult
@@ -32,7 +33,7 @@ from snowsplat.project.edit_record import shown_file
 from snowsplat.project.project import scene_at
 from snowsplat.project.studio_scene import TASKS, StudioScene, version_of
 from snowsplat.sfm.colmap.options import thread_count
-from snowsplat.sfm.cost import Step, measure_speed, predicted_seconds, survey
+from snowsplat.sfm.cost import measure_speed, survey
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, read_header
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.report.capture_verdict import few_photos
@@ -158,11 +159,8 @@ def survey_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
     sources = find_sources(scene.inputs())
     photos = survey(sources)
     speed = measure_speed(thread_count(None))
-    seconds = {}
-    for quality, preset in PRESETS.items():
-        seconds[quality] = Step(preset.training).seconds(speed)
-        if sources.posed is None:
-            seconds[quality] += predicted_seconds(photos, preset.photos, quality, speed)
+    poses = sources.posed is None
+    seconds = {each: expected_seconds(each, photos, speed, poses) for each in PRESETS}
     facts = describe_photos(sources) | {"poses": sources.posed is not None}
     few = few_photos(facts.get("photos", 0) + photos.frames)
     return {
