@@ -1,5 +1,6 @@
 """`snowsplat view`: finds the scene, prints the address of the page, ends on Ctrl-C."""
 
+import json
 import shutil
 import signal
 import socket
@@ -14,8 +15,10 @@ import pytest
 from snowsplat.cli import pages
 from snowsplat.cli.main import main
 from snowsplat.cli.pages import for_other_computers, opener_of
+from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.project.site_folder import SiteFolder
+from snowsplat.util.messages import message
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +139,12 @@ def test_which_scene_and_which_cameras(served, out, tmp_path):
     assert served(tmp_path / "garden.ply")[2][0].cameras == []
     (tmp_path / "make.json").write_text('{"file": "garden.ply"}')
     assert len(served(tmp_path / "garden.ply")[2][0].cameras) == 9
-    assert len(served(tmp_path)[2][0].cameras) == 9
+    shown, made = served(tmp_path)[2]
+    assert (len(shown.cameras), about.grade, made.grade) == (9, "", "")
+    verdict = Verdict.of([Reason("usable", message("few photos"))]).as_json()
+    record = {"file": "garden.ply", "stages": {"scene": {"result": {"verdict": verdict}}}}
+    (tmp_path / "make.json").write_text(json.dumps(record))
+    assert served(tmp_path)[2][1].grade == "usable"
     shutil.copy(out / "point_cloud/iteration_30/point_cloud.ply", tmp_path / "other.ply")
     assert served(tmp_path / "other.ply")[2][0].cameras == []
 

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from snowsplat.evaluation.verdict import Verdict
 from snowsplat.formats import format_for_reading
 from snowsplat.formats.lod import INDEX, LEVELS, read_index, read_lod
 from snowsplat.pipeline.compute import Compute
@@ -145,7 +146,8 @@ def viewed_scene(
         yield ViewedScene(index, counts[0], *page)
         return
     scene = _read(project, observer)
-    about = Description(title, made=made_on(scene.file))
+    verdict = Verdict.from_json(project.verdict)
+    about = Description(title, made=made_on(scene.file), grade=verdict.grade if verdict else "")
     if len(scene.gaussians) <= _LARGE_HERE:
         with observer.waiting("preparing"):
             page = site(about, scene.ready())

@@ -224,7 +224,13 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
             "div",
             { className: "snow-card" },
             element("h1", { textContent: scene.title }),
-            element("p", { textContent: scene.facts.replace("Gaussians", say("Gaussians")) }),
+            element(
+                "p",
+                { textContent: scene.facts.replace("Gaussians", say("Gaussians")) },
+                ...(scene.grade
+                    ? [element("b", { className: `snow-grade snow-${scene.grade}`, textContent: say(scene.grade) })]
+                    : []),
+            ),
             element("div", { className: "snow-buttons" }, ...(stops.length ? [photos] : []), clean, link, copied),
         ),
         hiding.element,

@@ -45,6 +45,7 @@ class Description:
     title: str  # the name of the scene
     licence: str = ""  # the licence of the scene, such as "CC BY 4.0"; "" if it is not stated
     made: date | None = None  # the day on which the scene was made; None if it is not known
+    grade: str = ""  # that of the verdict on it: good, usable or poor; "" if it is not shown
 
     def facts(self, gaussians: int) -> str:
         """The facts in one line: number of Gaussians, date, licence."""
@@ -107,6 +108,7 @@ def panel_settings(
     return {
         "title": about.title,
         "facts": about.facts(gaussians),
+        "grade": about.grade,
         "aspect": start.aspect,
         "start": view_numbers(start, start.aspect),
         "subject": [-x, -y, z, stops.radius],
