@@ -65,8 +65,9 @@ _LEAST_SHARE, _ENOUGH = 0.7, 20
 #: The variance of what is left in the octants, relative to that of the gains, is at most this. In
 #: photos where gains help it is 0.0 to 0.17, in photos with fixed exposure or gloss 0.34 to 15.
 _MOST_LEFT = 0.25
-#: Differences between photos from about the same place, in EV. With gloss they are 0.05 to 0.23.
-_LEAST_JUMPS = 0.25
+#: Differences between photos from about one place, in EV: 0.05 to 0.23 with gloss. Such photos are
+#: found with at most so many rays to points.
+_LEAST_JUMPS, _MOST_RAYS = 0.25, 100_000
 #: Half of an octant has about so many colours in a photo, or more. This share of the products of
 #: the medians of two halves is ignored at either end.
 _LEAST_COLORS, _TRIMMED = 8, 0.05
@@ -111,7 +112,7 @@ def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
         if int(products.isfinite().sum()) > 3 * min(_LEAST_SHARE * len(views), _ENOUGH):
             whole, variance = log_gains(logs), max(0.0, float(products.nanmean()))
             left = variance_left(logs - whole[:, None], xyz[::step].to(logs.device))
-            sample = xyz[:: -(-len(xyz) // _SAMPLE)].to(logs.device)
+            sample = xyz[:: -(-len(xyz) * len(views) // _MOST_RAYS)].to(logs.device)
             sources = source_views([view.camera for view in views], sample, 1)
             near = [found[0] if found else i for i, found in enumerate(sources)]
             jumps = 0.5 * float(((one - one[near]) * (other - other[near])).nanmean())
