@@ -65,8 +65,7 @@ _LEAST_SHARE, _ENOUGH = 0.7, 20
 #: The variance of what is left in the octants, relative to that of the gains, is at most this. In
 #: photos where gains help it is 0.0 to 0.17, in photos with fixed exposure or gloss 0.34 to 15.
 _MOST_LEFT = 0.25
-#: Differences between photos from about one place, in EV: 0.05 to 0.23 with gloss. Such photos are
-#: found with at most so many rays to points.
+#: Difference of photos from one place, in EV (gloss: 0.05 to 0.23), and most rays to find them.
 _LEAST_JUMPS, _MOST_RAYS = 0.25, 100_000
 #: Half of an octant has about so many colours in a photo, or more. This share of the products of
 #: the medians of two halves is ignored at either end.
