@@ -64,6 +64,6 @@ def covered_pixels(view: LensView | None, width: int, height: int) -> np.ndarray
         samples = np.ones((_SAMPLES * height, _SAMPLES * width), bool)
         for rows, positions in view.strips(_SAMPLES * width, _SAMPLES * height):
             samples[rows] = view.covered(positions)
-        made = samples.reshape(height, _SAMPLES, width, _SAMPLES).all((1, 3))
+        made = np.asarray(samples.reshape(height, _SAMPLES, width, _SAMPLES).all((1, 3)))
     made.flags.writeable = False
     return made

@@ -84,7 +84,7 @@ def open_image(
     """
     with open(path, "rb") as file:
         complete = _check_header(file)
-    image = Image.open(path, formats=list(formats))
+    image: Image.Image = Image.open(path, formats=list(formats))
     try:
         if page:
             image.seek(page)
