@@ -12,7 +12,6 @@ import torch
 from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.scene import edit
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
-from snowsplat.util.errors import UserError
 
 PREFIX = "KHR_gaussian_splatting:"
 
@@ -476,15 +475,44 @@ def test_a_node_far_from_0_keeps_the_precision(tmp_path, seed):
     assert np.abs(read.means).max() < 100
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda d: d["accessors"][0].update(sparse={"count": 2}), "accessor 0 is sparse"),
-        (lambda d: d["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}}), "instancing"),
-    ],
-)
-def test_what_would_be_read_wrongly_is_refused(seed, tmp_path, change, message):
-    document, binary, _ = seed
-    change(document)
-    with pytest.raises(UserError, match=message):
-        read_gaussians(assemble(tmp_path / "a.glb", document, binary))
+def test_sparse_accessors_and_instances(seed, tmp_path, one_line):
+    """Some rows of an attribute are replaced; a node draws its splats several times."""
+    document, binary, scene = seed
+    binary = bytearray(binary)
+
+    def append(*arrays: np.ndarray) -> list[int]:
+        for array in arrays:
+            view = {"buffer": 0, "byteOffset": len(binary), "byteLength": array.nbytes}
+            document["bufferViews"].append(view)
+            binary.extend(array.tobytes())
+        return [len(document["bufferViews"]) - i for i in range(len(arrays), 0, -1)]
+
+    rows, values = append(np.array([3, 9], "<u2"), np.array([[1, 2, 3], [4, 5, 6]], "<f4"))
+    position = document["accessors"][primitive(document)["attributes"]["POSITION"]]
+    position["sparse"] = {
+        "count": 2,
+        "indices": {"bufferView": rows, "componentType": 5123},
+        "values": {"bufferView": values},
+    }
+    (moves,) = append(np.array([[0, 0, 0], [10, 0, 0]], "<f4"))
+    accessor = {"bufferView": moves, "componentType": 5126, "count": 2, "type": "VEC3"}
+    document["accessors"].append(accessor)
+    attributes = {"TRANSLATION": len(document["accessors"]) - 1}
+    document["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    document["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+    document["buffers"][0]["byteLength"] = len(binary)
+    means = read_gaussians(assemble(tmp_path / "a.glb", document, bytes(binary))).means
+    expected = scene.means.clone()
+    expected[[3, 9]] = torch.tensor([[1.0, -2, -3], [4, -5, -6]])
+    torch.testing.assert_close(means, torch.cat([expected, expected + torch.tensor([10.0, 0, 0])]))
+    position.pop("bufferView")  # zeros
+    means = read_gaussians(assemble(tmp_path / "b.glb", document, bytes(binary))).means
+    assert int((means[:30] != 0).any(1).sum()) == 2
+    for change in (
+        lambda: position.__setitem__("count", 10**9),
+        lambda: position["sparse"]["indices"].__setitem__("componentType", 5126),
+        lambda: position["sparse"].__setitem__("count", 3),
+    ):
+        change()
+        path = assemble(tmp_path / "c.glb", document, bytes(binary))
+        assert one_line(path)

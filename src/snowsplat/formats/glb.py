@@ -37,8 +37,10 @@ _COMPONENTS = {
 }
 #: The component types of the arrays that are written.
 _CODES = {("f", 4): 5126, ("u", 1): 5121, ("u", 2): 5123, ("u", 4): 5125}
-# The extension of nodes that draw their mesh several times.
-_INSTANCING = "EXT_mesh_gpu_instancing"
+#: The component types of the indices of a sparse accessor.
+_INDICES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
+#: The extension of nodes that draw their mesh several times.
+INSTANCING = "EXT_mesh_gpu_instancing"
 _VERTICES, _TRIANGLES = 34962, 34963  # the targets of buffer views
 
 
@@ -220,9 +222,17 @@ def accessor(document: Document, index: int, *kinds: str) -> np.ndarray:
         raise Damaged("its accessor {index} does not have the type of its attribute", index=index)
     code, divisor = _COMPONENTS[entry["componentType"]]
     dtype, width, count = np.dtype(code), _WIDTHS[entry["type"]], _non_negative(entry["count"])
-    if "sparse" in entry:
-        raise Damaged("its accessor {index} is sparse, which is not supported", index=index)
-    result = _rows(document, entry, dtype, width, count).astype(np.float32)
+    sparse = entry.get("sparse")
+    if "bufferView" in entry or sparse is None:
+        result = _rows(document, entry, dtype, width, count).astype(np.float32)
+    elif count * width > document.size:  # zeros, of which the file has no bytes
+        raise Damaged("its accessor {index} exceeds the file", index=index)
+    else:
+        result = np.zeros((count, width), np.float32)
+    if sparse is not None:
+        changed, where = _non_negative(sparse["count"]), sparse["indices"]
+        rows = _rows(document, where, np.dtype(_INDICES[where["componentType"]]), 1, changed)
+        result[rows[:, 0]] = _rows(document, sparse["values"], dtype, width, changed)
     if entry.get("normalized", False) and divisor != 1.0:
         # The most negative integer also means -1.
         result = np.maximum(result / np.float32(divisor), np.float32(-1))
@@ -245,7 +255,8 @@ def _rows(
 
 
 def meshes(file: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """The meshes of the scene, each with ``world_from_mesh`` (4, 4) float64, for every node.
+    """The meshes of the scene, each with ``world_from_mesh`` (4, 4) float64, for every node and
+    every instance of it.
 
     Raises:
         Damaged: the nodes do not form trees; see also `accessor`.
@@ -272,10 +283,21 @@ def meshes(file: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
             raise Damaged("its nodes do not form trees")
         world_from_node = world_from_parent @ _local(node)
         if "mesh" in node:
-            if _INSTANCING in node.get("extensions", {}):
-                raise Damaged("it needs {extension}, which is not supported", extension=_INSTANCING)
-            yield _item(document, "meshes", node["mesh"]), world_from_node
+            mesh = _item(document, "meshes", node["mesh"])
+            for local in _instances(file, node):
+                yield mesh, world_from_node @ local
         waiting.extend((child, world_from_node) for child in children)
+
+
+def _instances(document: Document, node: dict[str, Any]) -> Iterator[np.ndarray]:
+    """(4, 4) ``node_from_mesh`` of each instance."""
+    attributes = node.get("extensions", {}).get(INSTANCING, {}).get("attributes")
+    if attributes is None:
+        yield np.eye(4)
+        return
+    columns = {name: accessor(document, each, "VEC3", "VEC4") for name, each in attributes.items()}
+    for values in zip(*columns.values(), strict=True):
+        yield _local({name.lower(): v for name, v in zip(columns, values, strict=True)})
 
 
 def _local(node: dict[str, Any]) -> np.ndarray:

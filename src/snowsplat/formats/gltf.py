@@ -48,7 +48,7 @@ _SPZ = (
     "KHR_spz_gaussian_splats_compression",
 )
 #: Extensions that a file may require.
-_UNDERSTOOD = {EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit", *_SPZ}
+_UNDERSTOOD = {EXTENSION, glb.INSTANCING, "KHR_mesh_quantization", "KHR_materials_unlit", *_SPZ}
 _SPACES = ("srgb_rec709_display", "lin_rec709_display")
 _ROUNDING = 1e-3  # of the largest scale
 _LEAST_BYTES = 26  # per Gaussian, with all attributes quantised except the colour
