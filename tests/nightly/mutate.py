@@ -54,7 +54,7 @@ PARTS = {
     "density": Part(("training/density/*.py",), ("tests/training/density",)),
     "optim": Part(
         ("training/step/optim.py", "training/settings/rates.py"),
-        ("tests/training/test_optim.py", "tests/training/test_lr_schedule.py"),
+        ("tests/training/test_optim.py", "tests/training/test_schedule.py"),
     ),
     "settings": Part(
         ("training/settings/*.py",),

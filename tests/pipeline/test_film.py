@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from snowsplat.pipeline.edit import film, film_preview, write_keys
-from snowsplat.pipeline.options.video import VideoSize
+from snowsplat.pipeline.options.video import VideoOptions, VideoSize
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.videos import cameras_along
 from snowsplat.project import page_film
@@ -17,6 +17,7 @@ from snowsplat.scene.geometry import Similarity
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.scene import viewing_frame
 
+from ..trajectory.rigs import camera_at
 from .test_edit import write_scene
 
 KEYS = [
@@ -105,3 +106,21 @@ def test_the_speeds_are_those_of_the_command_line(tmp_path):
         for each in (plan, even)
     ]
     assert near[0] > 1.5 * near[1]
+
+
+def test_sizes_are_even():
+    camera = camera_at((0.0, 0.0, -3.0))  # 64×48
+    assert VideoSize.parse(None).for_camera(camera) == (64, 48)
+    assert VideoSize.parse("127").for_camera(camera) == (126, 94)
+    assert VideoSize.parse("33x21").for_camera(camera) == (32, 20)
+    large = camera.scaled(4000, 3000)
+    assert VideoSize.parse(None).for_camera(large) == (1920, 1440)
+    assert VideoSize.parse("8192").for_camera(camera.scaled(1, 100_000)) == (8192, 8192)
+
+
+def test_number_of_frames():
+    assert VideoOptions(seconds=2.0, fps=12.5).frames == 25
+    assert VideoOptions(seconds=0.001, fps=1.0).frames == 1
+    for wrong in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(UserError, match="above 0"):
+            VideoOptions(seconds=wrong)

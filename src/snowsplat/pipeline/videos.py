@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -73,37 +72,96 @@ def render_video(
     if target is not None and Path(target).suffix.lower() != ".mp4":
         raise UserError("{target}: the name of a video must end in .mp4", target=target)
     device = (compute or Compute()).apply()
-    source = _load(Path(scene), iteration, options.name)
-    gaussians = source.gaussians.to(device)
+    gaussians, trained, background, file = _source(Path(scene), iteration, options.name)
+    size = VideoSize.parse(options.size)
+    cameras = cameras_along(
+        options.path, gaussians, trained, options.frames, size, ease=options.ease
+    )
+    gaussians = gaussians.to(device)
     if options.antialias is not None:
         gaussians.antialiased = options.antialias
-    cameras = cameras_along(
-        options.path,
-        source.gaussians,
-        source.cameras,
-        options.frames,
-        VideoSize.parse(options.size),
-        ease=options.ease,
-    )
-    around = None
+    around, first = None, cameras[0]
+    width, height = first.width, first.height
     if options.projection == "equirectangular":
         around = PanoramaRenderer(panorama_width(options.size), device)
+        width, height = around.width, around.height
         cameras = level_cameras(cameras)
-    file = source.file if target is None else Path(target)
-    return _Video(options, gaussians, cameras, around, source.background, file).write(observer)
+    file = file if target is None else Path(target)
+    files = {file: 2 * width if options.side_by_side else width}
+    if options.depth and not options.side_by_side:
+        files[file.with_name(f"{file.stem}_depth{file.suffix}")] = width
+    with_depth = options.depth or options.side_by_side
+
+    def draw(camera: Camera) -> tuple[np.ndarray, np.ndarray | None]:
+        color = torch.tensor(background)
+        if around is not None:
+            return to_8bit(around.render(gaussians, camera.cam_from_world, color)), None
+        output = render(gaussians, camera, color, with_depth=with_depth)
+        depth = None if output.depth is None else image_files.mean_depth(output.depth, output.alpha)
+        return to_8bit(output.image), depth
+
+    def frames() -> Iterator[list[np.ndarray]]:
+        near, far = 1.0, 2.0
+        if with_depth:  # one range for the whole video, so that its colours do not flicker
+            sample = cameras[:: -(-len(cameras) // _RANGE_FRAMES)]
+            depths = (draw(camera)[1] for camera in sample)
+            near, far = image_files.depth_range([depth for depth in depths if depth is not None])
+        for camera in cameras:
+            color, depth = draw(camera)
+            if depth is None:
+                yield [color]
+                continue
+            shown = image_files.depth_in_color(depth, near, far)
+            beside = options.side_by_side
+            yield [np.concatenate([color, shown], axis=1)] if beside else [color, shown]
+
+    with torch.no_grad():
+        every = around is not None
+        write_videos(files, height, options.fps, frames(), len(cameras), observer, every)
+    return [*files]
 
 
-@dataclass(frozen=True)
-class _Source:
-    """The scene to render, and the default file of the video."""
+def write_videos(
+    files: Mapping[Path, int],
+    height: int,
+    fps: float,
+    frames: Iterable[Sequence[np.ndarray]],
+    count: int,
+    observer: Observer,
+    panorama: bool = False,
+) -> None:
+    """Write videos of the same length, as the stage "video" of the observer.
 
-    gaussians: Gaussians
-    cameras: tuple[list[str], list[Camera]] | None  # names and cameras of the photos
-    background: tuple[float, float, float]
-    file: Path  # where the video is written if the user names no file
+    Args:
+        files: file -> width in pixels; width and height are even.
+        frames: for each time, a frame (height, width, 3) uint8 of each file.
+        count: their number.
+        panorama: whether the frames show all directions.
+
+    Raises: UserError: a file cannot be written.
+    """
+    started, report = time.monotonic(), observer.begin("video")
+    with ExitStack() as stack:
+        for file in files:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            remove_temporaries(file.parent, [file.name])
+        adds = [
+            stack.enter_context(video_writer(file, width, height, fps, panorama=panorama))
+            for file, width in files.items()
+        ]
+        for i, images in enumerate(frames):
+            for add, pixels in zip(adds, images, strict=True):
+                add(pixels)
+            report(i + 1, count, "frames")
+    first = next(iter(files.values()))
+    result = {"files": [*map(str, files)], "frames": count, "size": [first, height]}
+    observer.end("video", Outcome(result, time.monotonic() - started, False))
 
 
-def _load(scene: Path, iteration: int | None, name: str) -> _Source:
+def _source(
+    scene: Path, iteration: int | None, name: str
+) -> tuple[Gaussians, tuple[list[str], list[Camera]] | None, tuple[float, float, float], Path]:
+    """The scene, names and cameras of its photos, the background, and the default file."""
     project = Project.open(scene)
     if project.is_file:
         training, found = project.training, project.scene_file()
@@ -114,10 +172,10 @@ def _load(scene: Path, iteration: int | None, name: str) -> _Source:
         file = training.videos / f"{name}.mp4"
     gaussians = read_gaussians(found)
     if training is None or not training.is_training():
-        return _Source(gaussians, None, (0.0, 0.0, 0.0), file)
+        return gaussians, None, (0.0, 0.0, 0.0), file
     names, cameras = cameras_of(training)
     gaussians = seen_from_dataset(gaussians, training.origin())
-    return _Source(gaussians, (names, cameras) if names else None, training.background(), file)
+    return gaussians, (names, cameras) if names else None, training.background(), file
 
 
 def cameras_along(
@@ -180,81 +238,3 @@ def _in_frame_of(gaussians: Gaussians, cameras: list[Camera]) -> list[Camera]:
     if (middle - origin).norm() >= middle.norm():
         return cameras
     return [camera.seen_from(gaussians.origin) for camera in cameras]
-
-
-@dataclass(frozen=True)
-class _Video:
-    """A video to be rendered."""
-
-    options: VideoOptions
-    gaussians: Gaussians
-    cameras: Sequence[Camera]  # one per frame, all of the same size; width and height are even
-    # Renders all directions from the places of the cameras; None: what the cameras see.
-    around: PanoramaRenderer | None
-    background: tuple[float, float, float]
-    file: Path  # the file of the colour video; that of the depth has _depth in its name
-
-    @property
-    def with_depth(self) -> bool:
-        return self.options.depth or self.options.side_by_side
-
-    def write(self, observer: Observer) -> list[Path]:
-        """Render and write; returns the files. Raises: UserError: a file cannot be written."""
-        first = self.around or self.cameras[0]
-        width, height = first.width, first.height
-        files = self._files()
-        with torch.no_grad(), ExitStack() as stack:
-            started, report = time.monotonic(), observer.begin("video")
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            remove_temporaries(self.file.parent, [file.name for file, _ in files])
-            near, far = self._depth_range()
-            around = self.around is not None
-            adds = [
-                stack.enter_context(
-                    video_writer(file, factor * width, height, self.options.fps, panorama=around)
-                )
-                for file, factor in files
-            ]
-            for i, camera in enumerate(self.cameras):
-                for add, pixels in zip(adds, self._frame(camera, near, far), strict=True):
-                    add(pixels)
-                report(i + 1, len(self.cameras), "frames")
-        result = {
-            "files": [str(file) for file, _ in files],
-            "frames": len(self.cameras),
-            "size": [files[0][1] * width, height],
-        }
-        observer.end("video", Outcome(result, time.monotonic() - started, False))
-        return [file for file, _ in files]
-
-    def _files(self) -> list[tuple[Path, int]]:
-        """For each video: its file, and the number of images in a frame (2 if side by side)."""
-        if self.options.side_by_side:
-            return [(self.file, 2)]
-        depth = self.file.with_name(f"{self.file.stem}_depth{self.file.suffix}")
-        return [(self.file, 1), (depth, 1)] if self.options.depth else [(self.file, 1)]
-
-    def _frame(self, camera: Camera, near: float, far: float) -> list[np.ndarray]:
-        color, depth = self._render(camera)
-        if depth is None:
-            return [color]
-        shown = image_files.depth_in_color(depth, near, far)
-        beside = self.options.side_by_side
-        return [np.concatenate([color, shown], axis=1)] if beside else [color, shown]
-
-    def _depth_range(self) -> tuple[float, float]:
-        """One range of depths for the whole video, so that its colours do not flicker."""
-        if not self.with_depth:
-            return 1.0, 2.0
-        sample = self.cameras[:: -(-len(self.cameras) // _RANGE_FRAMES)]
-        depths = (self._render(camera)[1] for camera in sample)
-        return image_files.depth_range([depth for depth in depths if depth is not None])
-
-    def _render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray | None]:
-        background = torch.tensor(self.background)
-        if self.around is not None:
-            pose = camera.cam_from_world
-            return to_8bit(self.around.render(self.gaussians, pose, background)), None
-        output = render(self.gaussians, camera, background, with_depth=self.with_depth)
-        depth = None if output.depth is None else image_files.mean_depth(output.depth, output.alpha)
-        return to_8bit(output.image), depth

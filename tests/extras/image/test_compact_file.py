@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import struct
+import xml.etree.ElementTree as ElementTree
 import zlib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.extras.image.compact_file import decode, encode, read_compact, write_compact
+from snowsplat.extras.image.compact_file import (
+    decode,
+    encode,
+    read_compact,
+    write_compact,
+    write_svg,
+)
 from snowsplat.extras.image.fit import ImageGaussians
-from snowsplat.extras.image.options import Blending
+from snowsplat.extras.image.options import Blending, FitOptions
 from snowsplat.util.errors import UserError
 
-from .test_model import BLENDINGS, random_gaussians
+from ...browser import Browser
+from .test_fit import BLENDINGS, fitted, random_gaussians
+
+SVG = "{http://www.w3.org/2000/svg}"
 
 
 @pytest.mark.parametrize("blending", BLENDINGS)
@@ -132,3 +143,39 @@ def test_more_levels_than_gaussians() -> None:
     body[10:14] = struct.pack("<I", 50)
     with pytest.raises(ValueError, match="number of Gaussians"):
         decode(signed(bytes(body)))
+
+
+def test_one_ellipse_per_gaussian(tmp_path: Path) -> None:
+    gaussians = random_gaussians("front-to-back", 25)
+    write_svg(tmp_path / "image.svg", gaussians)
+    root = ElementTree.parse(tmp_path / "image.svg").getroot()
+    assert root.get("viewBox") == "0 0 40 30"
+    ellipses = root.findall(f"{SVG}ellipse")
+    gradients = {gradient.get("id"): gradient for gradient in root.findall(f"{SVG}radialGradient")}
+    assert len(ellipses) == len(gradients) == 25
+    # The last ellipse is in front: it is the first Gaussian.
+    last = ellipses[-1]
+    x, y = gaussians.rows[0, :2].tolist()
+    assert last.get("transform", "").startswith(f"translate({x:.2f} {y:.2f}) rotate(")
+    assert last.get("fill") == "url(#g24)"
+    center = gradients["g24"][0]
+    opacity = float(torch.sigmoid(gaussians.rows[0, 8]))
+    assert float(center.get("stop-opacity", "")) == pytest.approx(opacity, abs=2e-3)
+
+
+def test_additive_gaussians_have_no_svg(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="front-to-back"):
+        write_svg(tmp_path / "image.svg", random_gaussians("additive"))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.browser
+def test_a_browser_shows_the_image(tmp_path: Path) -> None:
+    gaussians = fitted(FitOptions(60, steps=100))
+    path = tmp_path / "image.svg"
+    write_svg(path, gaussians)
+    with Browser(200, 150) as browser:
+        page = browser.open(path.as_uri())
+        shown = page.screenshot()[:30, :40, :3]
+    image = torch.from_numpy(np.ascontiguousarray(shown)).float() / 255
+    assert psnr(image, gaussians.render().clamp(0, 1)) > 35

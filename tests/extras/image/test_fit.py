@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 from snowsplat import ops
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.extras.image.fit import Fitter, ImageGaussians
+from snowsplat.extras.image.fit import Fitter, ImageGaussians, column_count
 from snowsplat.extras.image.options import Blending, FitOptions
 from snowsplat.util.errors import SettingError
 
 from .photos import photo
-from .test_model import BLENDINGS
+
+BLENDINGS: tuple[Blending, ...] = ("front-to-back", "additive")
 
 
 def fitted(options: FitOptions, width: int = 40, height: int = 30) -> ImageGaussians:
@@ -89,3 +92,63 @@ def test_a_photo_of_one_colour() -> None:
 def test_settings_out_of_range(options: dict[str, int]) -> None:
     with pytest.raises(SettingError, match=next(iter(options))):
         FitOptions(**options)
+
+
+def random_gaussians(blending: Blending, count: int = 30, seed: int = 0) -> ImageGaussians:
+    """Gaussians in and around an image of 40×30 pixels."""
+    g = torch.Generator().manual_seed(seed)
+    rows = torch.zeros(count, column_count(blending))
+    rows[:, :2] = torch.rand(count, 2, generator=g) * torch.tensor([44.0, 34.0]) - 2
+    rows[:, 2:4] = torch.rand(count, 2, generator=g) * 2
+    rows[:, 4] = torch.rand(count, generator=g) * 9 - 3
+    rows[:, 5:8] = torch.rand(count, 3, generator=g)
+    if blending == "front-to-back":
+        rows[:, 8] = torch.randn(count, generator=g)
+    return ImageGaussians(40, 30, blending, rows, torch.tensor([0.2, 0.4, 0.1]))
+
+
+def test_conic_is_the_inverse_covariance() -> None:
+    rows = torch.tensor([[20.0, 15.0, math.log(4), math.log(1.5), 0.6, 1, 0, 0, 0]])
+    gaussians = ImageGaussians(40, 30, "front-to-back", rows, torch.zeros(3))
+    a, b, c = gaussians.splats().conics[0].tolist()
+    conic = torch.tensor([[a, b], [b, c]])
+    along = torch.tensor([math.cos(0.6), math.sin(0.6)])
+    across = torch.tensor([-math.sin(0.6), math.cos(0.6)])
+    assert float(along @ conic @ along) == pytest.approx(1 / 16, rel=1e-5)
+    assert float(across @ conic @ across) == pytest.approx(1 / 2.25, rel=1e-5)
+    assert float(along @ conic @ across) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("blending", BLENDINGS)
+def test_definition(blending: Blending) -> None:
+    """Each pixel, from the formula of the blending."""
+    gaussians = random_gaussians(blending)
+    y, x = torch.meshgrid(torch.arange(30) + 0.5, torch.arange(40) + 0.5, indexing="ij")
+    image, transmittance = torch.zeros(30, 40, 3), torch.ones(30, 40, 1)
+    for row in gaussians.rows:
+        cos, sin = math.cos(row[4]), math.sin(row[4])
+        dx, dy = x - row[0], y - row[1]
+        u, v = (cos * dx + sin * dy) / row[2].exp(), (cos * dy - sin * dx) / row[3].exp()
+        weight = torch.exp(-0.5 * (u * u + v * v))
+        if blending == "front-to-back":
+            weight = weight * torch.sigmoid(row[8])
+        weight = torch.where(weight < 1 / 255, 0, weight)[..., None]
+        image += transmittance * weight * row[5:8]
+        if blending == "front-to-back":
+            transmittance = transmittance * (1 - weight)
+    image += transmittance * gaussians.background
+    torch.testing.assert_close(gaussians.render(), image, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("blending", BLENDINGS)
+def test_a_larger_image_has_the_same_colours(blending: Blending) -> None:
+    gaussians = random_gaussians(blending)
+    small, large = gaussians.render(), gaussians.render(3)
+    assert large.shape == (90, 120, 3)
+    # The centre of each pixel is the centre of the middle one of 3×3.
+    torch.testing.assert_close(large[1::3, 1::3], small, rtol=0, atol=1e-3)
+
+
+def test_a_wrong_number_of_columns_is_an_error() -> None:
+    with pytest.raises(ValueError, match=r"must be \(N, 8\) for additive blending, got \(5, 9\)"):
+        ImageGaussians(4, 4, "additive", torch.zeros(5, 9), torch.zeros(3))

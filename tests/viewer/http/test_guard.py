@@ -133,7 +133,7 @@ def test_websockets(server):
     for options, status in (
         ({"origin": "http://evil.example"}, 403),
         ({"origin": "null"}, 403),
-        ({"additional_headers": {"X": "y" * 17_000}}, 400),
+        ({"additional_headers": {"X": "y" * 17_000}}, 431),
     ):
         with pytest.raises(InvalidStatus) as refused:
             websocket(server, "echo", **options)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,10 +13,9 @@ from snowsplat.extras.globe.options import LONGEST_NAME, GlobeOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.pipeline.videos import write_videos
 from snowsplat.project.project import Project
-from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import UserError
-from snowsplat.util.stages import Outcome
 
 
 @dataclass(frozen=True)
@@ -76,17 +74,8 @@ def make_globe(
     write_page(target, arrangement, name)
     if video is not None:
         width, height = options.video_size
-        globe_video = GlobeVideo(arrangement, engraving(name), width, height, options.fps)
-        _write(globe_video, Path(video), observer)
+        made = GlobeVideo(arrangement, engraving(name), width, height, options.fps)
+        frames = ([frame] for frame in made.frames())
+        write_videos({Path(video): width}, height, made.fps, frames, made.count, observer)
     count = len(arrangement.gaussians)
     return GlobeResult(target, None if video is None else Path(video), count)
-
-
-def _write(video: GlobeVideo, file: Path, observer: Observer) -> None:
-    started, report = time.monotonic(), observer.begin("video")
-    with video_writer(file, video.width, video.height, video.fps) as add:
-        for i, frame in enumerate(video.frames()):
-            add(frame)
-            report(i + 1, video.count, "frames")
-    result = {"files": [str(file)], "frames": video.count, "size": [video.width, video.height]}
-    observer.end("video", Outcome(result, time.monotonic() - started, False))
