@@ -131,9 +131,9 @@ def test_websockets(server):
         socket.send("hello")
         assert socket.recv() == "hello"
     for options, status in (
-        ({"origin": "http://evil.example"}, 403),
-        ({"origin": "null"}, 403),
-        ({"additional_headers": {"X": "y" * 17_000}}, 431),
+        ({"origin": "http://evil.example"}, {403}),
+        ({"origin": "null"}, {403}),
+        ({"additional_headers": {"X": "y" * 17_000}}, {400, 431}),  # in parts, or at once
     ):
         with pytest.raises(InvalidStatus) as refused:
             websocket(server, "echo", **options)
