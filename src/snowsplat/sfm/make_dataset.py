@@ -174,7 +174,8 @@ def _run(
     def write(report: Report) -> dict[str, Any]:
         sfm, coverage = outcomes["poses"].result, measure_coverage(DatasetFolder(folder).model)
         bad = problems(DatasetFolder(folder).photos, coverage.names)
-        verdict, values = capture_verdict(coverage, sfm, bad), asdict(options)
+        verdict = capture_verdict(coverage, sfm, bad, options.sfm.effort)
+        values = asdict(options)
         facts = {
             "inputs": stages.about["inputs"],
             "settings": values.pop("gather") | values.pop("sfm") | values,

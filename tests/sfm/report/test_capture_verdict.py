@@ -116,3 +116,14 @@ def test_real_datasets(name, grade):
         pytest.skip(f"no real dataset at ../shared/captures/{name}")
     measures = measure_coverage(model)
     assert capture_verdict(measures, sfm(len(measures.names)), {}).grade == grade
+
+
+def test_what_was_lost_with_little_effort_may_be_found_with_more():
+    few = sfm(20, unregistered={f"{i:02}.jpg": "" for i in range(20)})
+    advice = {
+        effort: str(capture_verdict(coverage(20), few, {}, effort).advice[0])
+        for effort in ("draft", "normal", "best")
+    }
+    assert advice["draft"].startswith("try the quality normal")
+    assert advice["normal"].startswith("try the quality best")
+    assert advice["best"].startswith("take more photos between")
