@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from snowsplat.pipeline.run.live_page import ADDRESS
+
 from ..ports import unused_port
 from ..waiting import wait_until
 
@@ -52,7 +54,7 @@ def test_watch_until_ctrl_c(start, trained):
 def test_watch_opens_the_page_of_a_training_that_goes_on_without_it(start, dataset, tmp_path):
     out = tmp_path / "out"
     training = start("train", dataset, "-o", out, "--iterations", 100_000)
-    wait_until((out / ".snowsplat.watch" / "socket").exists, 120)
+    wait_until((out / ADDRESS).exists, 120)
     process = start("watch", out)
     assert "after the present step" in process.stdout.readline()
     assert process.stdout.readline() == "closing the page does not end the training\n"
@@ -64,7 +66,7 @@ def test_watch_opens_the_page_of_a_training_that_goes_on_without_it(start, datas
     training.send_signal(signal.SIGINT)  # it still runs
     shown, err = training.communicate(timeout=60)
     assert "stopped after step" in shown + err
-    assert not (out / ".snowsplat.watch").exists()
+    assert not (out / ADDRESS).exists()
 
 
 def test_errors(refused, trained, tmp_path):

@@ -120,8 +120,9 @@ class Watchers:
             for connection in [*self._watching, *(each for each, _ in self._asking)]:
                 _send(connection, None)
         self._close_page()
-        with suppress(OSError):  # the output folder was moved or removed
-            (self._output / ADDRESS).unlink()
+        with suppress(OSError):  # the output folder was removed
+            os.unlink(ADDRESS, dir_fd=self._folder)
+        os.close(self._folder)
 
     def _listen(self) -> None:
         """Raises OSError: the file cannot be written, or there are no local sockets."""
@@ -134,6 +135,7 @@ class Watchers:
         self._place = Place(str(listener.address), key.hex())
         with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as place:
             json.dump(asdict(self._place), place)
+        self._folder = os.open(self._output, os.O_RDONLY)  # it may be moved
         self._listener = listener
         threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
 

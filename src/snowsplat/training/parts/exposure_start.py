@@ -113,7 +113,8 @@ def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
             left = variance_left(logs - whole[:, None], xyz[::step].to(logs.device))
             sample = xyz[:: -(-len(xyz) * len(views) // _MOST_RAYS)].to(logs.device)
             sources = source_views([view.camera for view in views], sample, 1)
-            near = [found[0] if found else i for i, found in enumerate(sources)]
+            nearest = [found[0] if found else i for i, found in enumerate(sources)]
+            near = torch.tensor(nearest, device=logs.device)
             jumps = 0.5 * float(((one - one[near]) * (other - other[near])).nanmean())
             everywhere = left <= _MOST_LEFT * variance or jumps >= (_LEAST_JUMPS * LOG_EV) ** 2
             gains = (whole - whole.nanmean(0)).nan_to_num().to("cpu", torch.float32)
