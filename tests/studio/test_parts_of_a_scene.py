@@ -36,6 +36,7 @@ def test_a_running_a_failed_and_a_finished_scene(studio, finished, monkeypatch):
         stages = texts(page, ".stages li[data-state=done]")
         assert ["30 photos (3 s)" in stages[0], "30 of 30" in stages[1]] == [True, True]
         assert "50 of 100" in texts(page, ".present")[0]
+        assert page.evaluate("document.title") == "about 20 s left – Box"
         assert "21.50 dB" in texts(page, ".figures dd")
         assert texts(page, ".notes li") == ["out of memory"]
         assert page.evaluate("document.querySelector('polyline').points.length") == 2

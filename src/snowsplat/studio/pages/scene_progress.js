@@ -34,7 +34,7 @@ export function progressPart(/** @type {import("./scene.js").ScenePage} */ page)
     page.update = now => {
         const state = now.state;
         showStages(stages, now);
-        showNow(present, state);
+        showNow(present, now);
         showFigures(figures, curve, state);
         notesPart.hidden = !state.notes?.length;
         notes.replaceChildren(...(state.notes ?? []).map(line => make("li", {}, told(line))));
@@ -121,7 +121,8 @@ function showStages(/** @type {HTMLElement} */ list, /** @type {import("./types.
 }
 
 /** The stage that runs, how far it is, and the time that is left. */
-function showNow(/** @type {HTMLElement} */ element, /** @type {import("./types.js").State} */ { now, steps }) {
+function showNow(/** @type {HTMLElement} */ element, /** @type {import("./types.js").Scene} */ { title, state }) {
+    const { now, steps } = state;
     if (!now) return element.replaceChildren(make("p", {}, "…"));
     const training = now.stage === "scene" && steps;
     const [count, total, left] = training
@@ -135,6 +136,8 @@ function showNow(/** @type {HTMLElement} */ element, /** @type {import("./types.
         make("progress", { ...(total ? { max: total, value: count } : {}), "aria-label": name }),
         make("p.soft", {}, left ? say("left", duration(left)) : ""),
     );
+    // Another tab of the browser shows it, too.
+    if (left) document.title = `${say("left", duration(left))} – ${title}`;
 }
 
 function showFigures(
