@@ -67,7 +67,7 @@ class Gathered:
 
     photos: list[Photo]
     left_out: list[LeftOut]
-    notes: list[str]  # lines for the user about what was cropped and masked
+    notes: list[Message]  # lines for the user about what was cropped and masked
 
 
 def gather(
@@ -105,7 +105,7 @@ def gather(
     if in_place:
         _refuse_changes(planned, sources.videos, options)
     folder.mkdir(parents=True, exist_ok=True)
-    notes: list[str] = []
+    notes: list[Message] = []
     try:
         photos, looks = write_photos(planned, dataset, options.size, in_place, left_out, report)
         photos = _with_panoramas(photos)
@@ -122,10 +122,13 @@ def gather(
         raise
     if sources.unused_masks:
         logger.warning(
-            "%s: mask not used, there is no such photo%s; the mask of IMG.jpg is masks/IMG.png, "
-            "IMG.jpg.png or IMG_mask.png",
-            shown(sources.unused_masks[0]),
-            f" (nor of {others} other masks)" if (others := len(sources.unused_masks) - 1) else "",
+            "%s",
+            message(
+                "{mask}: mask not used, there is no such photo ({count} such masks); the mask of "
+                "IMG.jpg is masks/IMG.png, IMG.jpg.png or IMG_mask.png",
+                mask=shown(sources.unused_masks[0]),
+                count=len(sources.unused_masks),
+            ),
         )
     if doubt := doubt_about_masks(looks):
         logger.warning("warning: %s", doubt)
@@ -193,7 +196,7 @@ def _take_frames(
     options: GatherOptions,
     panorama: bool,
     left_out: list[LeftOut],
-    notes: list[str],
+    notes: list[Message],
     report: Report,
 ) -> list[Photo]:
     frame_folder = folder / source.name
@@ -201,7 +204,7 @@ def _take_frames(
     max_frames = max_frame_count(clip, options.fps, options.frames)
     frames = extract_frames(clip, frame_folder, max_frames, options.size, report, panorama)
     label = source.path.name if not source.name else source.name
-    notes += [f"{label}: {line}" for line in frames.notes]
+    notes += [message("{video}: {line}", video=label, line=line) for line in frames.notes]
     left_out += [
         LeftOut(f"{label} at {seconds:.1f} s", "photos", reason)
         for seconds, reason in frames.skipped

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from snowsplat.sfm.ingest.content.fixed_parts import box_of, describe, find_fixed_parts
+from snowsplat.util.messages import message
 
 from ...pictures import HEIGHT, WIDTH, blurred, pan, wall
 
@@ -80,7 +81,7 @@ def test_bars_are_cut_off_so_that_the_centre_remains():
     assert left + right == 10 * WIDTH
     assert 410 <= left <= 440
     assert not parts.overlays.any()
-    assert describe(parts, True, "all 12 photos") == [
+    assert list(map(str, describe(parts, True, message("all 12 photos")))) == [
         "bars at the left and right: cut off in all 12 photos"
     ]
 
@@ -104,8 +105,8 @@ def test_a_single_bar_is_masked_because_the_centre_is_unknown():
     assert parts.crop is None
     assert parts.fixed[-40:].all()
     assert not parts.fixed[:-44].any()
-    assert describe(parts, False, "all 12 photos") == [
-        "a bar at the bottom: masked in all 12 photos"
+    assert list(map(str, describe(parts, False, message("all 12 photos")))) == [
+        "bars at the bottom: masked in all 12 photos"
     ]
 
 
@@ -128,7 +129,7 @@ def test_a_clock_is_masked_with_the_digits_that_change():
     assert parts.crop is None
     assert parts.overlays[pixels].all()
     assert parts.fixed.mean() < 0.15
-    (line,) = describe(parts, False, "all 12 photos")
+    (line,) = map(str, describe(parts, False, message("all 12 photos")))
     assert line.startswith("something does not move")
     assert "masked in all 12 photos" in line
 
@@ -174,5 +175,5 @@ def test_the_background_of_a_turntable_is_masked_in_each_photo():
         assert seen[~plate].mean() > 0.97
         assert seen[plate].mean() < 0.05
         assert not seen[115:126, 155:166].any()
-    (line,) = describe(parts, False, "all 16 photos")
+    (line,) = map(str, describe(parts, False, message("all 16 photos")))
     assert "as on a turntable" in line

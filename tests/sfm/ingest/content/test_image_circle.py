@@ -5,6 +5,7 @@ import pytest
 
 from snowsplat.sfm.ingest.content.fixed_parts import describe, find_fixed_parts
 from snowsplat.sfm.ingest.content.image_circle import find_image_circle
+from snowsplat.util.messages import message
 
 HEIGHT, WIDTH = 240, 320
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH] + 0.5
@@ -52,5 +53,5 @@ def test_what_is_outside_of_a_disc_is_fixed():
     assert (parts.overlays == parts.fixed).all()
     assert parts.fixed[5, 5]
     assert not parts.fixed[120, 160]
-    (line,) = describe(parts, False, "all 8 photos")
+    (line,) = map(str, describe(parts, False, message("all 8 photos")))
     assert line.startswith("the picture is a disc, as of a fisheye lens")

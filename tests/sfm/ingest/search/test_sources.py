@@ -135,8 +135,8 @@ def test_of_a_dataset_the_photos_are_used_and_the_poses_named(folder, tmp_path):
     assert {source.path.parent for source in found.files} == {root / folder}
     assert len(found.files) == 3
     (note,) = found.notes
-    assert "has camera poses already (sparse/0), which are estimated again" in note
-    assert f"snowsplat make {root}" in note
+    assert "has camera poses already (sparse/0), which are estimated again" in str(note)
+    assert f"snowsplat make {root}" in str(note)
     assert found.posed == root
     assert find_sources([root, root / "images_2"]).posed is None
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.ingest.content.image_circle import find_image_circle
 from snowsplat.sfm.ingest.content.still_background import Backdrop, find_backdrop
+from snowsplat.util.messages import Message, message
 
 #: Longest side in pixels of the copies.
 FIXED_SIDE = 640
@@ -304,28 +305,46 @@ def _with_enclosed(found: NDArray[np.bool_], copies: NDArray[np.uint8]) -> NDArr
 # Lines for the user
 
 
-def describe_bars(parts: FixedParts, cropped: bool, where: str) -> str:
+_SIDES = (message("left"), message("top"), message("right"), message("bottom"))
+
+
+def describe_bars(parts: FixedParts, cropped: bool, where: Message) -> Message:
     """Where the bars are, and what was done about them; ``where``: e.g. "all 14 photos"."""
-    names = ("left", "top", "right", "bottom")
-    sides = " and ".join(name for name, width in zip(names, parts.bars, strict=True) if width)
-    bars = "a bar" if sum(map(bool, parts.bars)) == 1 else "bars"
-    return f"{bars} at the {sides}: {'cut off' if cropped else 'masked'} in {where}"
+    sides = [side for side, width in zip(_SIDES, parts.bars, strict=True) if width]
+    named = sides[0]
+    for side in sides[1:]:
+        named = message("{sides} and {side}", sides=named, side=side)
+    if cropped:
+        return message("bars at the {sides}: cut off in {where}", sides=named, where=where)
+    return message("bars at the {sides}: masked in {where}", sides=named, where=where)
 
 
-def describe(parts: FixedParts, cropped: bool, where: str) -> list[str]:
+def describe(parts: FixedParts, cropped: bool, where: Message) -> list[Message]:
     """What is fixed to the frame, and what was done about it; ``where``: e.g. "all 14 photos"."""
     lines = [describe_bars(parts, cropped, where)] if any(parts.bars) else []
     if parts.circle is not None:
-        lines.append(f"the picture is a disc, as of a fisheye lens: its outside masked in {where}")
+        lines.append(
+            message(
+                "the picture is a disc, as of a fisheye lens: its outside masked in {where}",
+                where=where,
+            )
+        )
     elif parts.backdrop is not None:
         lines.append(
-            f"the background ({100 * parts.fixed.mean():.0f}% of the picture) stands still while "
-            f"something in front of it moves, as on a turntable: masked in {where}; if nothing "
-            "turns there, walk around the scene instead"
+            message(
+                "the background ({share:.0f}% of the picture) stands still while something in "
+                "front of it moves, as on a turntable: masked in {where}; if nothing turns there, "
+                "walk around the scene instead",
+                share=100 * parts.fixed.mean(),
+                where=where,
+            )
         )
     elif parts.overlays.any():
         lines.append(
-            "something does not move with the scene (a time stamp, a logo, a part of the camera "
-            f"or car): masked in {where}"
+            message(
+                "something does not move with the scene (a time stamp, a logo, a part of the "
+                "camera or car): masked in {where}",
+                where=where,
+            )
         )
     return lines

@@ -31,13 +31,14 @@ from snowsplat.sfm.ingest.content.sharpness import grey_copy
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.photos.mask_files import write_mask
 from snowsplat.sfm.ingest.photos.photo_files import open_image, save
+from snowsplat.util.messages import Message, message
 
 _CROPPED = (".jpg", ".jpeg", ".png")  # formats in which a cropped photo can be saved
 
 
 def set_fixed_parts_aside(
     photos: Sequence[Photo], dataset: Path, in_place: bool
-) -> tuple[list[Photo], list[str]]:
+) -> tuple[list[Photo], list[Message]]:
     """Crop and mask the photos of a dataset whose frames have fixed parts.
 
     Photos with transparency are left as they are: their background was removed already.
@@ -89,7 +90,7 @@ def set_fixed_parts_aside(
 
             for photo in pool.map(work, group):
                 changed[photo.name] = photo
-            lines += describe(parts, crop is not None, f"all {len(group)} photos")
+            lines += describe(parts, crop is not None, message("all {n} photos", n=len(group)))
     return [changed.get(photo.name, photo) for photo in photos], lines
 
 

@@ -94,7 +94,7 @@ class Sources:
     files: list[Source]
     left_out: list[LeftOut]
     unused_masks: list[Path]
-    notes: list[str] = field(default_factory=list)
+    notes: list[Message] = field(default_factory=list)
     posed: Path | None = None
 
     @property
@@ -134,7 +134,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
     files: list[Source] = []
     left_out: list[LeftOut] = []
     unused: list[Path] = []
-    notes: list[str] = []
+    notes: list[Message] = []
     posed: Path | None = None
     seen: dict[Path, Path] = {}
     folders = {"masks"}  # names in use
@@ -164,17 +164,26 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
         if (poses := poses_in(path)) is not None:
             posed = path if len(inputs) == 1 else None
             notes.append(
-                f"{shown(path)}: has camera poses already ({shown(poses)}), which are estimated "
-                f"again; to use them: snowsplat make {shown(path)}"
+                message(
+                    "{path}: has camera poses already ({poses}), which are estimated again; to use "
+                    "them: snowsplat make {path}",
+                    path=shown(path),
+                    poses=shown(poses),
+                )
             )
         elif (capture := photo_folder(path)) is not None:
             program, folder = capture
             notes.append(
-                f"{shown(path)}: a capture of {program} without camera poses; the photos "
-                f"in {shown(folder.relative_to(path).as_posix())} are used"
+                message(
+                    "{path}: a capture of {program} without camera poses; the photos in {folder} "
+                    "are used",
+                    path=shown(path),
+                    program=program,
+                    folder=shown(folder.relative_to(path).as_posix()),
+                )
             )
         elif (unread := advice(path)) is not None:
-            notes.append(f"{shown(path)}: {unread}")
+            notes.append(message("{path}: {unread}", path=shown(path), unread=unread))
         photos_in = _photos_of_dataset(path)
         found = _search(photos_in)
         photos, videos, others = photos_or_films(photos_in, found.photos, found.videos)

@@ -122,7 +122,7 @@ class Frames:
     # The sharpest frames of windows without a candidate: time (s) and reason.
     skipped: list[tuple[float, Message]] = field(default_factory=list)
     read: int = 0  # number of decoded frames
-    notes: list[str] = field(default_factory=list)  # lines for the user
+    notes: list[Message] = field(default_factory=list)  # lines for the user
     panoramas: bool = False  # the frames show all directions
 
 
@@ -186,9 +186,11 @@ def extract_frames(
         raise undecodable(clip.path, None)
     frames.skipped = candidates.skipped
     if parts is not None and crop is not None:
-        frames.notes.append(describe_bars(parts, True, "all frames"))
+        frames.notes.append(describe_bars(parts, True, message("all frames")))
     if order is not None:
-        frames.notes.append("the video is interlaced; rows between those of one field are computed")
+        frames.notes.append(
+            message("the video is interlaced; rows between those of one field are computed")
+        )
     report(clip.packets, clip.packets, f"frames of {name}")
     _log_summary(clip, frames)
     return frames
