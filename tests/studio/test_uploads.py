@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snowsplat.studio import uploads
-from snowsplat.studio.given_photos import given_photos, leave_out
+from snowsplat.studio.given_photos import first_given, given_photos, leave_out
 from snowsplat.studio.library import UnknownScene
 from snowsplat.studio.uploads import NoSpace, Upload, WrongPart, safe_path, write_part
 from snowsplat.util.errors import UserError
@@ -65,6 +65,7 @@ def test_photos_in_a_folder_of_the_user_stay(library, tmp_path):
     with pytest.raises(UserError, match="remove the photo there"):
         leave_out(scene, "a.jpg", True)
     assert (tmp_path / "a.jpg").exists()
+    assert first_given(scene) == tmp_path / "a.jpg"  # its picture on the start page
 
 
 def test_killed_before_a_complete_file_has_its_name(scene, monkeypatch):

@@ -33,12 +33,13 @@ class GivenPhoto:
 
 def given_photos(scene: StudioScene) -> list[GivenPhoto]:
     """The photos in natural order of their names; empty if nothing was given."""
-    if scene.found:
-        return []
-    roots = [Path(path) for path in scene.job.inputs] or [scene.photos]
-    found = [photo for root in roots for photo in _photos_in(root, False)]
-    found += _photos_in(scene.left_out, True)
+    found = [*_used(scene), *_photos_in(scene.left_out, True)]
     return sorted(found, key=lambda photo: natural_key(photo.name))[:_MOST]
+
+
+def first_given(scene: StudioScene) -> Path | None:
+    """A photo that is used. It is found soon, however many photos the folder of a user has."""
+    return next((photo.path for photo in _used(scene)), None)
 
 
 def leave_out(scene: StudioScene, name: str, out: bool) -> None:
@@ -60,12 +61,18 @@ def leave_out(scene: StudioScene, name: str, out: bool) -> None:
     os.replace(found.path, target)
 
 
+def _used(scene: StudioScene) -> Iterator[GivenPhoto]:
+    if not scene.found:
+        for root in [Path(path) for path in scene.job.inputs] or [scene.photos]:
+            yield from _photos_in(root, False)
+
+
 def _photos_in(root: Path, out: bool) -> Iterator[GivenPhoto]:
     if root.suffix.lower() in PHOTO_SUFFIXES and root.is_file():
         yield GivenPhoto(root.name, root, out)
     for folder, folders, names in os.walk(root):
-        folders[:] = [each for each in folders if not each.startswith(".")]
-        for name in names:
+        folders[:] = sorted(each for each in folders if not each.startswith("."))
+        for name in sorted(names):
             path = Path(folder) / name
             if path.suffix.lower() in PHOTO_SUFFIXES and not name.startswith("."):
                 yield GivenPhoto(path.relative_to(root).as_posix(), path, out)

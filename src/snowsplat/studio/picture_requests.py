@@ -15,7 +15,7 @@ from starlette.responses import Response
 from snowsplat.project.project import Project
 from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
-from snowsplat.studio.given_photos import PHOTO_SUFFIXES, given_photos
+from snowsplat.studio.given_photos import PHOTO_SUFFIXES, first_given, given_photos
 from snowsplat.studio.library import UnknownScene
 from snowsplat.studio.requests import File, SceneRoutes, Studio
 from snowsplat.util.errors import UserError
@@ -99,7 +99,7 @@ def shown_photos(scene: StudioScene) -> list[Path]:
             found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
             step = max(1, math.ceil(len(found) / _PHOTOS))
             return found[::step]
-    return [photo.path for photo in given_photos(scene) if not photo.out][:_PHOTOS]
+    return []
 
 
 def picture_of(scene: StudioScene) -> Path | None:
@@ -109,7 +109,7 @@ def picture_of(scene: StudioScene) -> Path | None:
         return poster
     training = Project.open(scene.made).training
     views = training.rendered_views() if training else []
-    return next(iter([*views[:1], *shown_photos(scene)[:1]]), None)
+    return next(iter([*views[:1], *shown_photos(scene)[:1]]), None) or first_given(scene)
 
 
 def small_jpeg(path: Path) -> bytes:
