@@ -18,10 +18,15 @@ CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "captures"
 
 
 def coverage(
-    count: int = 50, confirmed: float = 0.75, step: float = 0.07, directions: float = 40.0
+    count: int = 50,
+    confirmed: float = 0.75,
+    step: float = 0.07,
+    directions: float = 40.0,
+    at_a_place: int = 1,
 ) -> Coverage:
     names = [f"{i:02d}.jpg" for i in range(count)]
-    return Coverage(names, *(np.full(count, value) for value in (confirmed, step, directions)))
+    measures = (np.full(count, value) for value in (confirmed, step, directions))
+    return Coverage(names, *measures, place=np.arange(count) // at_a_place * at_a_place)
 
 
 def sfm(count: int = 50, lost: int = 0, **more: Any) -> dict[str, Any]:
@@ -50,8 +55,8 @@ def test_good_photos():
     [
         ({"step": 0.25}, {}, "usable", "typically 25% of the distance to the scene away"),
         ({"step": 0.6}, {}, "poor", "typically 60% of the distance"),
-        ({"count": 36, "step": 4e-4}, {"registered": [""] * 36}, "usable", "at most 18 places"),
-        ({"count": 90, "step": 4e-4}, {"registered": [""] * 90}, "good", "at most 45 places"),
+        ({"count": 36, "at_a_place": 3}, {"registered": [""] * 36}, "usable", "from 12 places"),
+        ({"count": 90, "at_a_place": 3}, {"registered": [""] * 90}, "good", "from 30 places"),
         ({"step": np.inf}, {}, "poor", "have no other photo that shows the same"),
         ({"confirmed": 0.4}, {}, "poor", "60% of the points are in only one other photo"),
         ({"count": 11}, {}, "usable", "11 photos are few"),

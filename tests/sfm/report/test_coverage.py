@@ -44,6 +44,14 @@ def test_a_walk_along_a_wall(measured):
     assert coverage.confirmed[4] == pytest.approx((5.2 - 4.8) / (6.2 - 4.8), abs=0.02)
 
 
+def test_places(measured):
+    """Brackets have one place. The small steps of a slow film add up."""
+    brackets = sideways([0.0, 1e-3, 2e-3, 1.0, 1.002, 2.0])
+    assert measured(brackets, wall(-3.0, 5.0)).place.tolist() == [0, 0, 0, 3, 3, 5]
+    film = sideways([3e-3 * i for i in range(8)])
+    assert measured(film, wall(-3.0, 5.0)).place.tolist() == [0, 0, 2, 2, 4, 4, 6, 6]
+
+
 def test_a_photo_that_shares_nothing(measured):
     coverage = measured(sideways([0.0, 1.0, 2.0, 30.0]), wall(-3.0, 5.0))
     assert np.isinf(coverage.step[3])

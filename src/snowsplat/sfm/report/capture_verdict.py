@@ -28,8 +28,6 @@ _FEW = 30
 #: by 6 degrees. At a fifth, 11 degrees, surfaces are hidden in one of two photos and seen in the
 #: other. At a half, 27 degrees, features are rarely recognised.
 _SMALL_STEP, _LARGE_STEP, _HUGE_STEP = 0.1, 0.2, 0.5
-#: At a smaller step, points move by less than a pixel in photos of 1000 pixels: one place.
-_SAME_PLACE = 1e-3
 #: If less than this share of the points of a typical photo is confirmed by two other photos, most
 #: of the scene is known from two photos only.
 _CONFIRMED = 0.5
@@ -92,13 +90,10 @@ def capture_verdict(
     # A few photos are enough for one side of a scene.
     if few and (few.grade == "poor" or not (one_way and step <= _SMALL_STEP)):
         reasons.append(few)
-    if repeats := int((coverage.step < _SAME_PLACE).sum()):
-        places = photos - repeats // 2  # each such place has at least two photos
+    if (places := len(set(coverage.place.tolist()))) < len(coverage.place):
         text = message(
-            "{repeats} of {photos} photos are taken from the place of another one, as brackets of "
-            "exposures are: there are at most {places} places, and held-out photos may have been "
-            "trained on at another exposure",
-            repeats=repeats,
+            "{photos} photos are taken from {places} places, as brackets of exposures are: held-out "
+            "photos may have been trained on at another exposure",
             photos=photos,
             places=places,
         )

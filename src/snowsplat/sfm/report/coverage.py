@@ -18,6 +18,8 @@ from snowsplat.util.natural_order import natural_key
 _POINTS = 20_000
 #: Two photos are neighbours if they share at least this share of the points of one of them.
 _NEIGHBOURS = 0.05
+#: At a smaller step, points move by less than a pixel in photos of 1000 pixels: one place.
+_SAME_PLACE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class Coverage:
     step: np.ndarray
     # (N,) angle in degrees between the optical axis and the mean of all axes; 180 for a panorama.
     directions: np.ndarray
+    # (N,) the first photo that was taken from the same place; that of brackets of exposures.
+    place: np.ndarray
 
 
 def measure_coverage(model: Path) -> Coverage:
@@ -60,7 +64,10 @@ def measure_coverage(model: Path) -> Coverage:
     poses = np.array([photos[name][0].cam_from_world().matrix() for name in names])
     around = np.array([len(photos[name]) > 1 for name in names])
     directions = np.where(around, 180.0, _directions(poses))
-    return Coverage(names, _confirmed(seen), _steps(seen, poses, around, xyz), directions)
+    centres = -(poses[:, :, :3].transpose(0, 2, 1) @ poses[:, :, 3:])[:, :, 0]
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    steps = _steps(seen, apart, _depths(seen, poses, around, xyz))
+    return Coverage(names, _confirmed(seen), steps.min(1), directions, _places(steps))
 
 
 def _confirmed(seen: np.ndarray) -> np.ndarray:
@@ -70,23 +77,39 @@ def _confirmed(seen: np.ndarray) -> np.ndarray:
     return np.where(count > 0, (seen & enough).sum(1) / np.maximum(count, 1), np.nan)
 
 
-def _steps(seen: np.ndarray, poses: np.ndarray, around: np.ndarray, xyz: np.ndarray) -> np.ndarray:
-    """`Coverage.step`; poses (N, 3, 4) are cam_from_world, points (P, 3) are in the world.
-    ``around`` (N,): it is a panorama; the depth of its points is their distance."""
-    centres = -(poses[:, :, :3].transpose(0, 2, 1) @ poses[:, :, 3:])[:, :, 0]
+def _steps(seen: np.ndarray, apart: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """(N, N) the distance ``apart`` to each photo that shows the same, divided by the depth (N,) of
+    the points; infinite for the others."""
     as_floats = seen.astype(np.float32)
     shared = as_floats @ as_floats.T
     neighbours = shared >= np.maximum(1.0, _NEIGHBOURS * seen.sum(1)[:, None])
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     neighbours &= apart > 1e-9 * apart.max()  # not itself, nor another view of a wide photo
-    nearest = np.where(neighbours, apart, np.inf).min(1)
+    neighbours &= (depths > 0)[:, None]
+    return np.where(neighbours, apart / np.where(depths > 0, depths, 1.0)[:, None], np.inf)
+
+
+def _depths(seen: np.ndarray, poses: np.ndarray, around: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    """(N,) the median depth of the points that a photo observes; NaN without points.
+
+    Poses (N, 3, 4) are cam_from_world, points (P, 3) are in the world. ``around`` (N,): it is a
+    panorama; the depth of its points is their distance.
+    """
     depths = np.full(len(poses), np.nan)
     for i, (pose, visible) in enumerate(zip(poses, seen, strict=True)):
         if visible.any():
             points = xyz[visible] @ pose[:, :3].T + pose[:, 3]
             depths[i] = np.median(np.linalg.norm(points, axis=1) if around[i] else points[:, 2])
-    steps: np.ndarray = np.where(depths > 0, nearest / np.where(depths > 0, depths, 1.0), np.inf)
-    return steps
+    return depths
+
+
+def _places(steps: np.ndarray) -> np.ndarray:
+    """`Coverage.place`. Photos of a slow film are not one place: each is compared with the first
+    photo of a place."""
+    place = np.arange(len(steps))
+    for i in range(len(steps)):
+        firsts = place[:i][(place[:i] == np.arange(i)) & (steps[i, :i] < _SAME_PLACE)]
+        place[i] = firsts.min(initial=i)
+    return place
 
 
 def _directions(poses: np.ndarray) -> np.ndarray:
