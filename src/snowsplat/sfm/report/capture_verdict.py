@@ -92,8 +92,8 @@ def capture_verdict(
         reasons.append(few)
     if (places := len(set(coverage.place.tolist()))) < len(coverage.place):
         text = message(
-            "{photos} photos are taken from {places} places, as brackets of exposures are: held-out "
-            "photos may have been trained on at another exposure",
+            "{photos} photos are taken from {places} places, as brackets of exposures are: "
+            "held-out photos may have been trained on at another exposure",
             photos=photos,
             places=places,
         )
