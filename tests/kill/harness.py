@@ -756,8 +756,10 @@ def _check_dataset(output: Path, whole: Path) -> None:
         raise Defect("other photos are registered")
     mine, theirs = (np.array([c[name] for name in sorted(c)]) for c in centres)
     size = np.ptp(theirs, axis=0).max()
-    if np.abs(mine - theirs).max() > 1e-3 * size:
-        raise Defect(f"cameras are {np.abs(mine - theirs).max() / size:.2g} of the scene apart")
+    apart = np.abs(mine - theirs).max() / size
+    if apart > 1e-3:
+        attempts = record["stages"]["poses"]["result"]["attempts"]
+        raise Defect(f"cameras are {apart:.2g} of the scene apart: {attempts}")
 
 
 def _centre(image: ColmapImage) -> np.ndarray:

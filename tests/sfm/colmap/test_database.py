@@ -42,9 +42,13 @@ def path(tmp_path):
     return path
 
 
-def add_features(path, count=5):
+def add_features(path, count=5, photo=1, descriptors=True):
+    sift = pycolmap.FeatureExtractorType.SIFT
     with closing_database(path) as database:
-        database.write_keypoints(1, np.ones((count, 4), np.float32))
+        database.write_keypoints(photo, np.ones((count, 4), np.float32))
+        if descriptors:
+            values = np.ones((count, 128), np.uint8)
+            database.write_descriptors(photo, pycolmap.FeatureDescriptors(sift, values))
 
 
 def names(path):
@@ -95,6 +99,19 @@ def test_features_are_reused_for_the_same_settings_only(path):
     assert feature_counts(path, len(PHOTOS))[0] == 5
     open_database(path, PHOTOS, Lens("auto"), "another")
     assert feature_counts(path, len(PHOTOS)) == [0] * len(PHOTOS)
+
+
+def test_what_an_interrupted_run_has_half_written(path):
+    """A kill between keypoints and descriptors, and one between a camera and its rig."""
+    add_features(path)
+    add_features(path, photo=2, descriptors=False)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("DELETE FROM rigs WHERE rig_id = 2")
+    open_database(path, PHOTOS, Lens("auto"), "one")
+    assert feature_counts(path, len(PHOTOS))[:2] == [5, 0]
+    add_features(path, photo=2)
+    with closing_database(path) as database:
+        assert database.num_rigs() == 2
 
 
 def test_another_camera_model_keeps_the_features(path):

@@ -91,6 +91,11 @@ def open_database(path: Path, photos: list[Photo], lens: Lens, fingerprint: str)
             connection.execute("CREATE TABLE snowsplat (fingerprint TEXT)")
             connection.execute("INSERT INTO snowsplat VALUES (?)", (fingerprint,))
     else:
+        with closing(sqlite3.connect(path)) as connection, connection:
+            # Of a run that was interrupted between the two writes of the features of a photo.
+            connection.execute(
+                "DELETE FROM keypoints WHERE image_id NOT IN (SELECT image_id FROM descriptors)"
+            )
         set_cameras(path, photos, lens)
 
 
@@ -223,6 +228,7 @@ def _write_cameras(database: pycolmap.Database, photos: list[Photo], lens: Lens)
             database.update_camera(camera)
         else:
             database.write_camera(camera, use_camera_id=True)
+        if not database.exists_rig(camera.camera_id):  # an interrupted run may lack it
             rig = pycolmap.Rig()
             rig.rig_id = camera.camera_id
             rig.add_ref_sensor(camera.sensor_id)

@@ -73,12 +73,10 @@ def extract_features(
         found = pool.map(detect, [photos[i] for i in left])
         for done, (i, features) in enumerate(zip(left, found, strict=True)):
             progress.report(len(photos) - len(left) + done, len(photos), "photos with features")
-            transaction = pycolmap.DatabaseTransaction(opened)
             opened.write_keypoints(i + 1, features.keypoints)
             sift = pycolmap.FeatureExtractorType.SIFT
             descriptors = pycolmap.FeatureDescriptors(sift, features.descriptors)
             opened.write_descriptors(i + 1, descriptors)
-            del transaction  # ends it
         progress.report(len(photos), len(photos), "photos with features")
 
 

@@ -87,7 +87,7 @@ def match_pairs(
             return pool.submit(match, read_features(i), read_features(j), max_error)
 
         report = functools.partial(progress.report, what="matched pairs")
-        _in_blocks(opened, pairs, opened.exists_matches, submit, opened.write_matches, report)
+        _in_blocks(pairs, opened.exists_matches, submit, opened.write_matches, report)
 
 
 def verify_pairs(
@@ -114,29 +114,26 @@ def verify_pairs(
 
         report = functools.partial(progress.report, what="verified pairs")
         exists, write = opened.exists_two_view_geometry, opened.write_two_view_geometry
-        _in_blocks(opened, pairs, exists, submit, write, report)
+        _in_blocks(pairs, exists, submit, write, report)
         report(len(pairs), len(pairs))
 
 
 def _in_blocks(
-    database: pycolmap.Database,
     pairs: Sequence[tuple[int, int]],
     exists: Callable[[int, int], bool],
     submit: Callable[[int, int], Future[Any]],
     write: Callable[[int, int, Any], None],
     report: Callable[[int, int], None],
 ) -> None:
-    """Compute the results of those ``pairs`` that do not exist yet in threads, and write each block
-    of them in one transaction. The functions take image ids."""
+    """Compute the results of those ``pairs`` that do not exist yet in threads, and write them in
+    blocks. The functions take image ids."""
     remaining = [(i + 1, j + 1) for i, j in pairs if not exists(i + 1, j + 1)]
     for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
         report(len(pairs) - len(remaining) + start, len(pairs))
         block = remaining[start : start + _PAIRS_PER_BLOCK]
         jobs = [submit(*pair) for pair in block]
-        transaction = pycolmap.DatabaseTransaction(database)
         for pair, job in zip(block, jobs, strict=True):
             write(*pair, job.result())
-        del transaction  # the destructor ends the transaction
 
 
 def _cameras(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
