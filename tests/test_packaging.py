@@ -254,21 +254,6 @@ def test_make_without_a_compiler_names_the_package_to_install(bare_path):
     assert result.stderr.splitlines()[0] == NO_COMPILER
 
 
-def test_command_is_installed():
-    pyproject = (REPOSITORY / "pyproject.toml").read_text()
-    assert 'snowsplat = "snowsplat.__main__:main"' in pyproject
-    result = run(
-        sys.executable,
-        "-m",
-        "snowsplat",
-        "--help",
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY / "src")},
-    )
-    assert result.returncode == 0, result.stderr
-    for subcommand in ("train", "render", "evaluate", "info"):
-        assert subcommand in result.stdout
-
-
 def test_public_names_can_be_imported():
     import snowsplat
 

@@ -111,13 +111,6 @@ def test_rotations_are_about_x_then_y_then_z(run, tmp_path):
     torch.testing.assert_close(means, torch.tensor([[1.0, 0.0, 0.0]]), rtol=0, atol=1e-6)
 
 
-def test_several_scenes_are_merged(run, ply, tmp_path):
-    write_gaussians(tmp_path / "b.spz", scene(30, 3, seed=1))
-    assert run("convert", ply, tmp_path / "b.spz", tmp_path / "c.ply").code == 0
-    both = read_gaussians(tmp_path / "c.ply")
-    assert (len(both), both.sh_degree) == (430, 3)
-
-
 def test_antialiased_scenes_are_marked(run, ply, tmp_path):
     mip = scene(30, 2, seed=1)
     mip.antialiased = True
@@ -132,20 +125,6 @@ def test_antialiased_scenes_are_marked(run, ply, tmp_path):
     assert mixed.code == 0
     assert "only some of the scenes are antialiased" in mixed.err
     assert not read_gaussians(tmp_path / "d.ply").antialiased
-
-
-def test_the_newest_scene_of_an_output_folder(run, refused, ply, tmp_path):
-    for step, count in ((900, 5), (1000, 7)):
-        path = tmp_path / f"out/point_cloud/iteration_{step}/point_cloud.ply"
-        path.parent.mkdir(parents=True)
-        write_gaussians(path, scene(count, 0))
-    assert run("convert", tmp_path / "out", tmp_path / "b.spz").code == 0
-    assert len(read_gaussians(tmp_path / "b.spz")) == 7
-    shutil.copytree(tmp_path / "out", tmp_path / "made/scene")  # as `make` does
-    assert run("convert", tmp_path / "made", tmp_path / "c.spz").code == 0
-    assert len(read_gaussians(tmp_path / "c.spz")) == 7
-    (tmp_path / "empty").mkdir()
-    assert "contains no scene" in refused("convert", tmp_path / "empty", tmp_path / "d.spz")
 
 
 def test_an_existing_file(run, refused, ply, tmp_path):

@@ -236,15 +236,6 @@ def test_errors_write_nothing(refused, dataset, tmp_path, flags, expected):
     assert not (tmp_path / "out").exists()
 
 
-def test_two_photos_are_too_few_and_leave_no_files(refused, dataset, tmp_path):
-    two = tmp_path / "two"
-    two.mkdir()
-    for name in ("view_00.png", "view_01.png"):
-        shutil.copy(dataset / "images" / name, two)
-    refused("make", two, "-o", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("minutes", [[], ["--minutes", "5"]])
 def test_the_inputs_are_searched_once(refused, dataset, tmp_path, monkeypatch, minutes):
     """In the plan, the check of the folder, the estimate of the time, and the copies of photos."""

@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -210,28 +209,6 @@ def test_a_full_disk_keeps_finished_stages(garden, photos, run, tmp_path, monkey
     result = run("sfm", photos, "-o", out, *QUICK)
     assert result.code == 0
     assert result.out.count("done before") == 2
-
-
-@pytest.mark.nightly  # kill/test_kills.py kills at other moments
-@pytest.mark.parametrize("stage", ["photos", "poses", "images"])
-def test_after_a_kill_in_any_stage_the_same_command_resumes(stage, photos, run, start, tmp_path):
-    out = tmp_path / "garden"
-    command = ("sfm", photos, "-o", out, *QUICK)
-    begun = {
-        "photos": lambda: out.exists(),
-        "poses": lambda: (out / "distorted" / "database.db").exists(),
-        "images": lambda: (out / "images").exists(),
-    }[stage]
-    with start(*command) as process:
-        while not begun():
-            assert process.poll() is None
-            time.sleep(0.005)
-        process.kill()
-    result = run(*command)
-    assert result.code == 0, result.err
-    dataset = load_dataset(out)
-    assert len(dataset.train) + len(dataset.test) == 6
-    assert not (out / ".new").exists()
 
 
 @pytest.mark.parametrize("command", ["sfm", "make"])

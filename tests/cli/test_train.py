@@ -138,19 +138,6 @@ def test_a_setting_of_another_recipe(refused, dataset, tmp_path):
 # Reproducing and resuming
 
 
-def test_seed_threads_checkpoints_and_quiet_do_not_matter(run, dataset, tmp_path):
-    a, b, c = (tmp_path / name for name in "abc")
-    assert run("train", dataset, "-o", a, *QUICK).code == 0
-    flags = ("--threads", 2, "--checkpoint-every", 7, "--quiet")
-    assert run("train", dataset, "-o", b, "--iterations", 30, *flags).code == 0
-    assert run("train", dataset, "-o", c, *QUICK, "--seed", 1).code == 0
-    assert scene(a) == scene(b) != scene(c)
-    assert {p.name for p in (b / "checkpoints").iterdir()} == {
-        "step_000021.safetensors",
-        "step_000028.safetensors",
-    }
-
-
 def wait_for(path: Path, process) -> None:
     deadline = time.monotonic() + 60
     while not path.exists():
@@ -396,10 +383,3 @@ def test_divergence_names_the_last_good_checkpoint(refused, run, dataset, tmp_pa
     assert all(tensor.isfinite().all() for tensor in checkpoint.load(path).tensors.values())
     assert run("train", "-o", out, "--resume", "--iterations", step, "-q").code == 0
     assert read_gaussians(out / f"point_cloud/iteration_{step}/point_cloud.ply").usable_rows().all()
-
-
-def test_divergence_without_a_checkpoint(refused, dataset, tmp_path):
-    out = tmp_path / "out"
-    line = refused("train", dataset, "-o", out, "--iterations", 40, "--lr-sh-dc", 1e38, "-q")
-    assert line.endswith("there is no checkpoint yet")
-    assert not out.exists()

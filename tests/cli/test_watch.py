@@ -2,17 +2,13 @@
 
 import signal
 import socket
-import sys
 import urllib.error
 import urllib.request
 from pathlib import Path
 
 import pytest
 
-from snowsplat.pipeline.run.live_page import ADDRESS
-
 from ..ports import unused_port
-from ..waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -48,25 +44,6 @@ def test_watch_until_ctrl_c(start, trained):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="there are no local sockets")
-def test_watch_opens_the_page_of_a_training_that_goes_on_without_it(start, dataset, tmp_path):
-    out = tmp_path / "out"
-    training = start("train", dataset, "-o", out, "--iterations", 100_000)
-    wait_until((out / ADDRESS).exists, 120)
-    process = start("watch", out)
-    assert "after the present step" in process.stdout.readline()
-    assert process.stdout.readline() == "closing the page does not end the training\n"
-    url = url_of(process)
-    assert b"<html" in page_at(url)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (0, "")
-    training.send_signal(signal.SIGINT)  # it still runs
-    shown, err = training.communicate(timeout=60)
-    assert "stopped after step" in shown + err
-    assert not (out / ADDRESS).exists()
 
 
 def test_errors(refused, trained, tmp_path):

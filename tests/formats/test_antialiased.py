@@ -77,18 +77,3 @@ def test_a_sog_may_have_the_older_mark(tmp_path, make_scene, mark):
     meta = json.loads((tmp_path / "meta.json").read_text())
     (tmp_path / "meta.json").write_text(json.dumps(meta | {"antialias": mark}))
     assert read_gaussians(tmp_path / "meta.json").antialiased == mark
-
-
-@pytest.mark.slow  # Node is started
-def test_splat_transform_knows_the_marks(tmp_path, antialiased, splat_transform):
-    """It reads ours, and writes them into each other format."""
-    for name in ("a.ply", "a.compressed.ply", "a.spz"):
-        write_gaussians(tmp_path / name, antialiased)
-        splat_transform(tmp_path / name, tmp_path / "back.ply")
-        assert read_gaussians(tmp_path / "back.ply").antialiased
-    for name in ("b.compressed.ply", "b.spz"):
-        splat_transform(tmp_path / "a.ply", tmp_path / name)
-        assert read_gaussians(tmp_path / name).antialiased
-    write_gaussians(tmp_path / "a.sog", antialiased)
-    splat_transform(tmp_path / "a.sog", tmp_path / "back.ply")
-    assert read_gaussians(tmp_path / "back.ply").antialiased

@@ -175,14 +175,6 @@ def test_the_files_do_not_depend_on_the_number_of_threads(tmp_path, make_scene):
     assert ones == threes
 
 
-def test_progress_counts_files(tmp_path, make_scene):
-    calls = []
-    arrays = GaussianArrays.from_gaussians(make_scene(COUNT, 0))
-    write_lod(tmp_path / INDEX, arrays, sizes=SMALL, report=lambda *counted: calls.append(counted))
-    total = len(read_index(tmp_path / INDEX).files)
-    assert calls == [(done, total, "files") for done in range(1, total + 1)]
-
-
 def test_levels_are_replaced_and_other_files_stay(tmp_path, make_scene, monkeypatch):
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "levels_9").mkdir()

@@ -87,31 +87,6 @@ def packed_grads(seed: int, count: int) -> Tensor:
     return normal(generator(seed), count, 16)
 
 
-def gradients(scene: Scene, packed_grad: Tensor) -> dict[str, Tensor]:
-    """The float64 gradient of every parameter, by autograd through the reference's `project`."""
-    leaf = scene.to(torch.float64)
-    splats = leaf.project(reference)
-    splats.packed.backward(packed_grad)
-    grads = {name: p.grad for name, p in leaf.params.items()}
-    return {name: grad for name, grad in grads.items() if grad is not None}
-
-
-def test_first_step_is_the_learning_rate(variant: Variant) -> None:
-    """From zero moments m̂ = g and v̂ = g²: every value moves by its rate against its gradient."""
-    scene = random_scene(0, 20)
-    state = Optimised(variant, scene, fresh=True)
-    before = state.copy()
-    grad = packed_grads(1, len(state.visible()))
-    wanted = gradients(scene, grad)
-    state.step(grad)
-    for name in PARAMETERS:
-        moved = (state.params[name] - before[name]).double()
-        clear = wanted[name].abs() > 1e-3 * wanted[name].abs().max()
-        assert clear.any()
-        expected = -RATES[name] * wanted[name].sign()
-        torch.testing.assert_close(moved[clear], expected[clear], rtol=1e-3, atol=1e-6)
-
-
 def test_step_matches_the_paper(variant: Variant) -> None:
     """Three steps of torch's Adam on the same gradients."""
     scene = random_scene(1, 25)

@@ -185,22 +185,6 @@ def test_cubins_contain_all_launched_kernels(file, architecture, compiler):
             assert built.local_bytes <= LOCAL_BYTES[architecture], name
 
 
-def test_the_local_memory_of_a_cubin(compiler, tmp_path):
-    source = tmp_path / "spills.cu"
-    source.write_text(
-        '#include "cuda/device.h"\n'
-        "struct Spills { int64_t n; const int32_t* in; int32_t* out; SNOW_FIELDS(n, in, out) };\n"
-        "SNOW_KERNEL(spills, 96, Spills) {\n"
-        "  int32_t row[40];\n"
-        "  for (int i = 0; i < 40; i++) row[p.in[i]] = i;\n"
-        "  p.out[0] = row[p.n];\n"
-        "}\n"
-    )
-    for architecture in ARCHITECTURES:
-        (built,) = kernels_in(compiler.compile(source, f"sm_{architecture}")[0]).values()
-        assert built == Built(96, [24], 160)
-
-
 def cpu_entries() -> set[str]:
     """The functions of the CPU's library."""
     sections = elf_sections((PACKAGE / "_lib" / "libsnowsplat_baseline.so").read_bytes())
@@ -241,12 +225,6 @@ STATISTIC_SOURCES = [
     "layout.h",
     "portable.h",
 ]
-
-
-def test_sources_of_a_kernel_include_all_headers(tmp_path):
-    found = nvrtc.sources(nvrtc.path_of("statistic"))
-    assert [path.name for path in found] == STATISTIC_SOURCES
-    assert all(path.is_absolute() for path in found)
 
 
 def test_a_compile_error_has_the_message_and_the_line(compiler, tmp_path):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops import AdamRates, Capacity
+from snowsplat.ops import Capacity
 
 from .scenes import (
     Scene,
@@ -21,7 +21,6 @@ from .scenes import (
     normal,
     random_scene,
     random_splats,
-    take_step,
     uniform,
 )
 
@@ -170,39 +169,4 @@ def test_plane_sweep(dtype: torch.dtype) -> None:
         ops.set_num_threads(threads)
         depth, score = ops.plane_sweep(*tensors, 0.0, 1.0, planes=5)
         results.append({"inverse depth": depth, "score": score})
-    assert_same_bits(results)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", DTYPES, ids=str)
-@pytest.mark.parametrize("visible_only", [False, True])
-def test_training_steps(dtype: torch.dtype, visible_only: bool) -> None:
-    """Two complete steps: project, rasterize, loss, Adam."""
-    rates = dict.fromkeys(the_scene().params, 0.01)
-    results = []
-    target = uniform(generator(1), 0, 1, HEIGHT, WIDTH, 3).to(dtype)
-    for threads in THREADS:
-        ops.set_num_threads(threads)
-        scene = the_scene().to(dtype, requires_grad=False)
-        m = {name: torch.zeros_like(p) for name, p in scene.params.items()}
-        v = {name: torch.zeros_like(p) for name, p in scene.params.items()}
-        for step in (1, 2):
-            splats = scene.project(ops)
-            splats.packed.requires_grad_()
-            image, _, _ = ops.rasterize(splats, WIDTH, HEIGHT)
-            ops.photometric_loss(image, target).backward()
-            assert splats.ids is not None
-            assert splats.packed.grad is not None
-            take_step(
-                ops,
-                scene,
-                m,
-                v,
-                splats.ids,
-                splats.packed.grad,
-                AdamRates(rates, step),
-                visible_only=visible_only,
-            )
-        moments = {f"m of {n}": t for n, t in m.items()} | {f"v of {n}": t for n, t in v.items()}
-        results.append({**scene.params, **moments})
     assert_same_bits(results)

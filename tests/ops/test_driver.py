@@ -214,12 +214,6 @@ def test_a_kernel_with_another_struct_is_rejected(function, error, gpus):
     assert gpus.cuCtxGetCurrent() == (0, 0)
 
 
-def test_the_struct_is_checked_once(gpus):
-    for _ in range(3):
-        driver.run(KERNEL, "one", 1, some(on_gpu(torch.zeros(1))))
-    assert gpus.count("cuMemcpyDtoH") == 1
-
-
 def test_code_is_loaded_once_for_each_file_and_device(gpus):
     first, second = on_gpu(torch.zeros(1)), on_gpu(torch.zeros(1), OnSecondGpu)
     rasterize = Kernel("rasterize", threads=32, items=32)

@@ -19,8 +19,6 @@ from snowsplat.util.native_layout import SEGMENT
 from .scenes import (
     EMULATED_LENGTH,
     REFERENCE,
-    Adam,
-    Scene,
     Variant,
     assert_close,
     differentiable_columns,
@@ -28,7 +26,6 @@ from .scenes import (
     leaf_splats,
     normal,
     one_line,
-    random_scene,
     random_splats,
     smooth_scene,
     uniform,
@@ -109,30 +106,6 @@ def test_definition(variant: Variant, seed: int) -> None:
         assert_close(actual, expected, max(variant.forward, 1e-7))
 
 
-def test_one_splat_is_a_gaussian(variant: Variant) -> None:
-    opacity, sigma, depth = 0.8, 2.0, 3.0
-    color = torch.tensor([[0.25, 0.5, 1.0]], dtype=torch.float64)
-    background = torch.tensor([1.0, 0.0, 0.5], dtype=torch.float64)
-    splats = Splats2D.pack(
-        torch.tensor([[8.5, 6.5]], dtype=torch.float64),
-        torch.tensor([[sigma**-2, 0, sigma**-2]], dtype=torch.float64),
-        torch.tensor([opacity], dtype=torch.float64),
-        torch.tensor([depth], dtype=torch.float64),
-        color,
-    )
-    image, alpha, z = variant.ops.rasterize(
-        leaf_splats(splats, variant.dtype), 20, 13, background.to(variant.dtype), with_depth=True
-    )
-    y, x = torch.meshgrid(torch.arange(13), torch.arange(20), indexing="ij")
-    squared = (x - 8.0) ** 2 + (y - 6.0) ** 2  # the centre is that of the pixel (8, 6)
-    expected = opacity * torch.exp(-squared.double() / (2 * sigma**2))
-    expected = torch.where(expected < 1 / 255, 0, expected)
-    assert z is not None
-    assert_close(alpha, expected, 1e-5)
-    assert_close(z, depth * expected, 1e-5)
-    assert_close(image, expected[..., None] * (color - background) + background, 1e-5)
-
-
 def test_shapes_and_storage(variant: Variant) -> None:
     splats = leaf_splats(random_splats(0, 9, 20, 13, channels=5), variant.dtype)
     image, alpha, depth = variant.ops.rasterize(splats, 20, 13)
@@ -197,15 +170,6 @@ def test_close_depths_blend_in_order(variant: Variant, depth: float) -> None:
     assert_close(image[0, 0], torch.tensor([0.25, 0.5]), 1e-5)
 
 
-def test_order_of_rows_does_not_matter(variant: Variant) -> None:
-    splats = random_splats(3, 60, 23, 17)
-    shuffled = Splats2D(splats.packed[torch.randperm(60, generator=generator(0))], None, 3)
-    images = [
-        variant.ops.rasterize(leaf_splats(s, variant.dtype), 23, 17)[0] for s in (splats, shuffled)
-    ]
-    assert_close(images[0], images[1], variant.forward)
-
-
 def test_no_splats(variant: Variant) -> None:
     splats = leaf_splats(random_splats(0, 0, 5, 4), variant.dtype)
     background = torch.tensor([0.25, 0.5, 1.0], dtype=variant.dtype, requires_grad=True)
@@ -248,18 +212,6 @@ def check_gradients(
     fast = double.engine == "emulated"
     torch.manual_seed(0)
     assert torch.autograd.gradcheck(outputs, inputs, eps=1e-6, atol=1e-6, rtol=1e-6, fast_mode=fast)
-
-
-def test_finite_differences_from_gaussian_to_pixel(double: Variant) -> None:
-    scene = smooth_scene(1, sh_degree=1).rows([0, 1])
-    scene.params["sh_rest"] = scene.params["sh_rest"][:, :3].contiguous()
-    scene = scene.to(torch.float64)
-
-    def image(*leaves: Tensor) -> Tensor:
-        splats = scene.of_leaves(*leaves).project(double.ops)
-        return double.ops.rasterize(splats, *scene.size)[0]
-
-    check_gradients(double, image, tuple(scene.leaves().values()))
 
 
 def compare(
@@ -336,10 +288,6 @@ def test_native_agrees_with_the_reference(
 ) -> None:
     splats = random_splats(channels, 60, 23, 17, channels)
     compare(native, splats, 23, 17, with_background=with_background)
-
-
-def test_native_agrees_with_the_reference_without_depth(native: Variant) -> None:
-    compare(native, random_splats(2, 60, 23, 17), 23, 17, with_depth=False)
 
 
 @pytest.mark.parametrize(
@@ -550,26 +498,6 @@ def test_native_agrees_with_the_reference_for_thousands(native: Variant) -> None
     compare(native, splats, width, height, with_depth=False)
 
 
-def test_native_agrees_with_the_reference_from_gaussian_to_pixel(native: Variant) -> None:
-    scene = random_scene(21, 120)
-    background = torch.tensor([0.1, 0.9, 0.4], dtype=torch.float64)
-    cotangent = normal(generator(3), 17, 23, 3)
-    results: list[tuple[Tensor, Scene]] = []
-    for variant in (REFERENCE, native):
-        leaf = scene.to(variant.dtype)
-        splats = leaf.project(variant.ops)
-        image, _, _ = variant.ops.rasterize(splats, 23, 17, background.to(variant.dtype))
-        (image * cotangent.to(image)).sum().backward()
-        results.append((image, leaf))
-    (wanted, expected), (got, actual) = results
-    assert_close(got, wanted, native.forward, "image")
-    for name, leaf_tensor in expected.leaves().items():
-        grad = actual.leaves()[name].grad
-        assert grad is not None
-        assert leaf_tensor.grad is not None
-        assert_close(grad, leaf_tensor.grad, native.backward, f"gradient of {name}")
-
-
 @pytest.mark.parametrize("required", ["packed", "background"])
 def test_only_requested_gradients_are_computed(native: Variant, required: str) -> None:
     splats = leaf_splats(random_splats(0, 20, 9, 9), native.dtype, requires_grad=False)
@@ -682,29 +610,6 @@ def test_abs_grad_adds_up(variant: Variant) -> None:
     assert (once[1::3].sum(dim=1) > 0).any()
     assert_close(leaf.abs_grad, 1 + 2 * once, variant.backward)
     assert (leaf.abs_grad[::3] == 1).all()
-
-
-def test_two_dimensional_fitting(variant: Variant) -> None:
-    """Splats without ids are fitted to an image by gradient descent."""
-    target = torch.zeros(16, 16, 3, dtype=variant.dtype)
-    target[4:12, 6:14] = torch.tensor([0.9, 0.5, 0.1], dtype=variant.dtype)
-    start = random_splats(0, 24, 16, 16, opacity=(0.4, 0.8))
-    means2d, colors = start.means2d.to(variant.dtype), start.colors.to(variant.dtype)
-    log_sigmas = torch.full((24, 2), 0.7, dtype=variant.dtype)
-    logits = torch.zeros(24, dtype=variant.dtype)
-    leaves = [means2d.clone(), colors.clone(), log_sigmas, logits]
-    optimiser = Adam([leaf.requires_grad_() for leaf in leaves], [0.15] * 4)
-    losses = []
-    for _ in range(24):
-        inverse = torch.exp(-2 * leaves[2])
-        conics = torch.stack([inverse[:, 0], 0 * inverse[:, 0], inverse[:, 1]], dim=1)
-        depths = torch.arange(24, dtype=variant.dtype)
-        splats = Splats2D.pack(leaves[0], conics, leaves[3].sigmoid(), depths, leaves[1])
-        image, _, _ = variant.ops.rasterize(splats, 16, 16)
-        loss = (image - target).square().mean()
-        optimiser.step(torch.autograd.grad(loss, leaves))
-        losses.append(float(loss.detach()))
-    assert losses[-1] < 0.1 * losses[0]
 
 
 WRONG = {

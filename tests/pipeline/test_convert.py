@@ -41,18 +41,6 @@ def test_size_of_a_file():
     assert sizes == [10_000_000, 500_000_000, 800_000, None, None, None, None]
 
 
-def test_invalid_edits():
-    for edits, setting in (
-        ({"sh_degree": 4}, "sh_degree"),
-        ({"scale": 0.0}, "scale"),
-        ({"crop": (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)}, "crop"),
-        ({"decimate": "101%"}, "decimate"),
-    ):
-        with pytest.raises(SettingError) as error:
-            Edits(**edits)
-        assert error.value.setting == setting
-
-
 def test_two_scenes_are_merged(tmp_path):
     zeros = torch.zeros(3, 1, 3)
     one = Gaussians(

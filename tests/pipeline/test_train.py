@@ -21,7 +21,7 @@ from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.parts import unexplained
 from snowsplat.training.parts.unexplained import excluded_line
-from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.errors import UserError
 
 
 class Recorder(Observer):
@@ -253,18 +253,6 @@ def test_a_damaged_file_of_metrics_is_replaced(dataset, tmp_path, damaged):
     assert (tmp_path / "metrics.json").read_text() == whole
 
 
-def test_without_photos_that_are_left_out_nothing_is_said(dataset, tmp_path):
-    recorder = Recorder()
-    settings = {"iterations": 4, "leave_out_after": 0.5}
-    result = train(
-        dataset, tmp_path, TrainOptions(settings=settings, hold_out=8), observer=recorder
-    )
-    assert result.left_out == ()
-    assert not any("not explained" in note for note in recorder.notes)
-    assert "left_out" not in json.loads((tmp_path / "metrics.json").read_text())
-    assert "Photos that the scene does not explain" not in result.report.read_text()
-
-
 @pytest.mark.parametrize(
     ("count", "expected"),
     [
@@ -277,19 +265,6 @@ def test_without_photos_that_are_left_out_nothing_is_said(dataset, tmp_path):
 )  # fmt: skip
 def test_the_line_about_photos_that_are_left_out(count, expected):
     assert str(excluded_line([f"{i}.jpg" for i in range(count)])) == expected
-
-
-def test_options_that_contradict_each_other():
-    with pytest.raises(UserError, match="`minutes` and `iterations` cannot be combined"):
-        options(5, minutes=1.0)
-    with pytest.raises(SettingError, match="^minutes: 0.0 is too small"):
-        TrainOptions(minutes=0.0)
-
-
-def test_the_error_of_a_nonempty_folder_names_the_settings(dataset, tmp_path):
-    train(dataset, tmp_path / "out", options(2))
-    with pytest.raises(UserError, match="use `resume` to continue it, `overwrite` to replace it"):
-        train(dataset, tmp_path / "out", options(2))
 
 
 def test_a_time_budget_reads_the_dataset_once(tmp_path, monkeypatch):

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 import snowsplat
-from snowsplat import Camera, Gaussians, UserError, rasterization
+from snowsplat import UserError, rasterization
 from snowsplat.ops import Splats2D, View, reference, scratch
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.scene import rasterization as module
-from snowsplat.scene.render import render
 
 from ..ops.engines import launcher
 from ..ops.scenes import assert_close, generator, normal, one_line, uniform
@@ -224,26 +223,6 @@ def test_opaque_and_flat_gaussians_have_gradients() -> None:
     backward(*near.rendered()[:2])
     for name in ("opacities", "means"):
         assert_close(given.grads()[name], near.grads()[name].double(), 1e-2, name)
-
-
-@pytest.mark.isa
-def test_the_image_is_that_of_render() -> None:
-    """A scene of snowsplat, with its activations applied, as a script for gsplat does."""
-    given = inputs("SH").of(torch.float32)
-    scene = Gaussians(
-        given.means,
-        given.scales.log(),
-        given.quats,
-        given.opacities.logit(),
-        given.colors[:, :1],
-        given.colors[:, 1:],
-    )
-    (fx, _, cx), (_, fy, cy), _ = given.Ks[1].tolist()
-    output = render(scene, Camera(WIDTH, HEIGHT, fx, fy, cx, cy, given.viewmats[1, :3]))
-    given.backgrounds.zero_()
-    colors, alphas, _ = given.rendered(sh_degree=3, near_plane=0.2)
-    assert_close(colors[1], output.image.double(), 1e-5)
-    assert_close(alphas[1, ..., 0], output.alpha.double(), 1e-5)
 
 
 # Batches and the dictionary of intermediate results

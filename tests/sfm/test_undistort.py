@@ -17,7 +17,6 @@ from snowsplat.data import load_dataset
 from snowsplat.data.photos.decode import load_image, load_mask
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.orient import orientation
 from snowsplat.sfm.progress import silent
 from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError
@@ -219,17 +218,6 @@ def test_without_distortion_photos_are_copied(tmp_path, model_of):
         assert copied == (dataset / "input" / name).read_bytes()
     mask = Image.open(dataset / "masks" / f"{NAMES[1]}.png")
     assert sorted(mask.getcolors()) == sorted([(5000, 0), (WIDTH * HEIGHT - 5000, 255)])
-
-
-def test_the_orientation_can_be_inverted(dataset):
-    model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
-    scene_from_sfm = orientation(model).scene_from_sfm
-    undistort(dataset, PHOTOS, scene_from_sfm, False, silent)
-    after = pycolmap.Reconstruction(dataset / "sparse" / "0")
-    back = Similarity.from_json(json.loads(json.dumps(scene_from_sfm.to_json()))).inverse()
-    for number, image in model.images.items():
-        centre = torch.from_numpy(after.images[number].projection_center())
-        assert np.allclose(back.apply(centre).numpy(), image.projection_center())
 
 
 @pytest.mark.parametrize("threads", [1, 3])

@@ -33,13 +33,6 @@ def test_ellipse_of_cameras_that_surround_the_focus():
     assert float((path[0].position - ring(24)[0].position).norm()) < 0.1
 
 
-def test_ellipse_stays_near_the_cameras_if_most_are_on_one_side():
-    path = ellipse_path([*ring(8, 3.0, 3.0), *ring(40, 3.0, 3.0, turn=1.0)], 50, 3.0)
-    check_closed_path(path, 50)
-    radii = (positions(path) - FOCUS)[:, [0, 2]].norm(dim=1)
-    assert 2.9 < float(radii.min()) <= float(radii.max()) < 3.1
-
-
 @pytest.mark.parametrize("turn", [0.0, 0.4, 1.0, 2.5])
 def test_ellipse_stays_within_the_arc_that_cameras_cover(turn):
     """It does not show the focus from directions that no camera has seen."""
@@ -84,23 +77,6 @@ def test_cameras_that_look_straight_down():
     steps = speeds(path, closed=True)
     assert float(steps.max() / steps.min()) < 1.02
     assert float((positions(path)[:, 1] + 4.0).abs().max()) < 1.0
-
-
-def test_spiral_stays_within_cameras_that_look_in_one_direction():
-    cameras = wall()
-    path = spiral_path(cameras, 240, 5.0)
-    check_closed_path(path, 240)
-    places, given = positions(path), positions(cameras)
-    inside = (places[:, :2] >= given[:, :2].min(0).values - 0.06) & (
-        places[:, :2] <= given[:, :2].max(0).values + 0.06
-    )
-    assert bool(inside.all())
-    # The spiral reaches both sides of the middle and passes through it.
-    offsets = places[:, :2] - given[:, :2].mean(0)
-    assert float(offsets.min()) < -0.2 < 0.2 < float(offsets.max())
-    assert float(offsets.norm(dim=1).min()) < 0.01
-    focus = torch.tensor([0.5, 0.225, 5.0]).double()
-    assert float(misses(path, focus).max()) < 2.0
 
 
 def test_spiral_is_rejected_if_cameras_look_in_all_directions():
@@ -259,12 +235,6 @@ def test_spiral_reaches_the_outer_cameras():
     assert float(places[:, 0].abs().max()) == pytest.approx(1.6 * math.sin(0.4 * math.pi), rel=0.03)
     # Along the viewing direction: half of 2% of the distance, since all cameras are in a plane.
     assert float(places[:, 2].abs().max()) == pytest.approx(0.05, rel=0.01)
-
-
-def test_radius_of_a_spiral_is_the_80_percent_quantile():
-    """Of the distances from the middle, here 0, 0.15, … 3.0 on both sides."""
-    path = spiral_path(wall(1, 41), 200, 5.0)
-    assert float(path[100].position[1]) == pytest.approx(3.0 - 2.4, rel=0.01)
 
 
 @pytest.mark.parametrize(("spread", "one"), [(38.0, True), (44.0, False)])

@@ -1,6 +1,5 @@
 """Videos: decoding returns the written frames, and no partial file is left."""
 
-import itertools
 import math
 import os
 import subprocess
@@ -115,12 +114,6 @@ def test_other_encoders_get_a_bit_rate(tmp_path, monkeypatch):
     assert bits == pytest.approx(0.25 * 128 * 96 * 24, rel=0.4)
 
 
-def test_the_smallest_video(tmp_path):
-    with video_writer(tmp_path / "a.mp4", 2, 2, 24) as add:
-        add(np.full((2, 2, 3), 255, np.uint8))
-    assert decoded(tmp_path / "a.mp4")[0].min() > 250
-
-
 def interrupted(path: Path, stop: type[BaseException]) -> None:
     with video_writer(path, WIDTH, HEIGHT, 24) as add:
         add(image(0))
@@ -183,20 +176,3 @@ def test_the_first_available_encoder_is_used(monkeypatch, available, used):
 
     monkeypatch.setattr("av.codec.Codec", codec)
     assert video_module._encoder() == used
-
-
-def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
-    """Frames are encoded one by one and not collected first."""
-    import tracemalloc
-
-    def peak(count: int) -> int:
-        tracemalloc.start()
-        with video_writer(tmp_path / "a.mp4", WIDTH, HEIGHT, 24) as add:
-            for i in itertools.islice(itertools.cycle(range(10)), count):
-                add(image(i))
-        memory = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return memory
-
-    peak(5)
-    assert peak(200) < peak(20) + 3 * WIDTH * HEIGHT * 10

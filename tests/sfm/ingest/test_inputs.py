@@ -182,16 +182,6 @@ def test_unusable_photos_are_skipped_and_named(tmp_path):
     assert reasons["cap.png"] == "is completely black"
 
 
-def test_one_thread_has_the_same_result(tmp_path, monkeypatch):
-    root = write_photos(tmp_path / "p", 5, "webp")
-    (root / "2.webp").write_text("no photo")
-    many = gathered(root, tmp_path / "a")
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
-    one = gathered(root, tmp_path / "b")
-    assert many == one
-    assert content(tmp_path / "a") == content(tmp_path / "b")
-
-
 def test_a_video(tmp_path):
     path = write_video(tmp_path / "walk around.MP4", pan(30))
     made = gathered(path, tmp_path / "out", frames=6)

@@ -3,7 +3,6 @@
 import logging
 import weakref
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
@@ -11,14 +10,11 @@ import pytest
 from PIL import Image
 
 from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED
-from snowsplat.sfm.ingest.video.clip import decoded_frames, max_frame_count, read_clip
+from snowsplat.sfm.ingest.video.clip import decoded_frames, read_clip
 from snowsplat.sfm.ingest.video.video_frames import SAME_VIEW, extract_frames, rgb_image
 from snowsplat.sfm.progress import silent
-from snowsplat.util.errors import UserError
 
 from ...pictures import HEIGHT, WIDTH, blurred, pan, wall, write_video
-
-REAL = Path(__file__).resolve().parents[5] / "shared" / "captures" / "walkaround.mp4"
 
 pytestmark = pytest.mark.slow  # decodes videos
 
@@ -92,15 +88,6 @@ def test_a_short_scene_between_two_cuts_is_kept(tmp_path):
     assert min(taken) < 6
     assert max(taken) > 26
     assert len(taken) <= 12
-
-
-def test_the_same_video_gives_the_same_frames(tmp_path):
-    video = write_video(tmp_path / "a.mp4", travel([1] * 20 + [6] * 20)[0])
-    one, two = (extract(video, tmp_path / name, 9) for name in "ab")
-    assert one == two
-    for frame in one.kept:
-        content = (tmp_path / "a" / frame.name).read_bytes()
-        assert content == (tmp_path / "b" / frame.name).read_bytes()
 
 
 def test_few_files_and_few_frames_in_memory(tmp_path, monkeypatch):
@@ -241,37 +228,6 @@ def test_progress_reaches_the_end(tmp_path):
     )
     assert calls[0] == (10, 25, "frames of a.mp4")
     assert calls[-1] == (25, 25, "frames of a.mp4")
-
-
-def test_a_full_disk_is_not_reported_as_a_damaged_video(tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("snowsplat.sfm.ingest.video.video_frames.save", full)
-    with pytest.raises(OSError, match="No space left"):
-        extract(write_video(tmp_path / "a.mp4", [wall()] * 3), tmp_path / "f", 1)
-
-
-@pytest.mark.slow
-def test_a_real_video(tmp_path):
-    if not REAL.is_file():
-        pytest.skip("no real video at ../shared/captures/walkaround.mp4")
-    clip = read_clip(REAL)
-    assert (clip.packets, clip.width, clip.height) == (706, 720, 1280)
-    assert clip.seconds == pytest.approx(23.53, abs=0.05)
-    made = extract(REAL, tmp_path / "f", max_frame_count(clip, None, None))
-    assert made.read == 706
-    assert 54 <= len(made.kept) <= 60
-    assert {reason for _, reason in made.skipped} == {SAME_VIEW}
-    # Around 4.5 s and 22.7 s the camera jerks; the frames selected there are sharp.
-    taken = [round(frame.seconds * 30) for frame in made.kept]
-    assert not {137, 138, 683, 684} & set(taken)
-
-
-def test_not_a_video(tmp_path):
-    (tmp_path / "a.mp4").write_text("x")
-    with pytest.raises(UserError):
-        extract(tmp_path / "a.mp4", tmp_path / "f", 3)
 
 
 def frame_of(signals, transfer, height=64):
