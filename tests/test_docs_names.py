@@ -259,30 +259,6 @@ def test_a_page_names_only_what_exists(page):
     assert problems(text_of(page)) == []
 
 
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("`training/core/config.py`", "no file training/core/config.py"),
-        ("`sfm/colmop/`", "no folder sfm/colmop/"),
-        ("`--no-such-flag`", "no flag --no-such-flag: --no-such-flag"),
-        ("`train --port-name`", "no flag --port-name: train --port-name"),
-        ("`convert --eval`", "no flag --eval: convert --eval"),
-        ("```sh\nsnowsplat capture a\n```", "no subcommand capture: snowsplat capture a"),
-        ("`snowsplat.Trainr`", "no name snowsplat.Trainr"),
-        ("`ops.projection_of`", "no name ops.projection_of"),
-        ("`find_all_parts_of`", "no name find_all_parts_of: find_all_parts_of"),
-        ("`ops/native.py` (`lunch`)", "no lunch in ops/native.py"),
-    ],
-)
-def test_a_name_that_does_not_exist_is_found(text, problem):
-    assert problem in problems(text)
-
-
-def test_what_exists_is_no_problem():
-    text = "`ops/native.py` (`launch`), `ops.project(gaussians, view)`, `train --eval`, `formats/`"
-    assert problems(f"{text}\n\n```sh\nsnowsplat make walk.mp4 --minutes 5\n```") == []
-
-
 def test_the_number_of_scene_formats_is_told():
     readable = {fmt.name.removesuffix(" in JSON") for fmt in FORMATS if fmt.read is not None}
     numbers = {10: "ten", 11: "eleven", 12: "twelve", 13: "thirteen"}

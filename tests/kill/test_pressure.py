@@ -1,11 +1,9 @@
 """Full and read-only disks, removed folders, limits, narrow terminals: one-line errors, no loss."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -355,16 +353,3 @@ def test_view_of_a_missing_scene(runner, place, trained):
     shutil.copytree(trained, place / "trained")
     shutil.rmtree(place / "trained" / "point_cloud")
     refused(runner.run(["view", place / "trained", "--no-browser"]), "contains no scene")
-
-
-def test_a_run_has_the_result_of_the_command(runner, trained, tmp_path):
-    """The file is the same as that of a separate process."""
-    (runner.folder / "forked").mkdir()
-    assert runner.run(["convert", trained, runner.folder / "forked" / "a.spz"]).code == 0
-    source = Path(checkpoint.__file__).parents[2]
-    subprocess.run(
-        [sys.executable, "-m", "snowsplat", "convert", trained, tmp_path / "a.spz"],
-        env={**os.environ, "PYTHONPATH": str(source)},
-        check=True,
-    )
-    assert digest(tmp_path / "a.spz") == digest(runner.folder / "forked" / "a.spz")

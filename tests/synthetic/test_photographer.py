@@ -13,7 +13,6 @@ from snowsplat.synthetic.scene import Lamp, Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
 from ..scenes.coarse import coarse_still_life
-from ..scenes.lenses import FisheyeLens
 
 pytestmark = pytest.mark.slow
 
@@ -86,24 +85,6 @@ def test_lens_directions_are_the_inverse_of_project(distortion):
     directions = lens.directions(pixels)
     assert np.allclose(np.linalg.norm(directions, axis=0), 1)
     assert np.abs(lens.project(5 * directions) - pixels).max() < 1e-9
-
-
-@pytest.mark.parametrize("distortion", [(0.0,) * 4, (0.03, -0.008, 0.001, 0.0)])
-def test_fisheye_directions_are_the_inverse_of_project(distortion):
-    lens = FisheyeLens(640, 480, 230.0, distortion)  # 199° from corner to corner
-    pixels = np.random.default_rng(0).uniform([[0], [0]], [[640], [480]], (2, 500))
-    directions = lens.directions(pixels)
-    assert directions[2].min() < 0
-    assert np.allclose(np.linalg.norm(directions, axis=0), 1)
-    assert np.abs(lens.project(5 * directions) - pixels).max() < 1e-9
-
-
-def test_fisheye_lens_is_colmaps_opencv_fisheye_model():
-    pycolmap = pytest.importorskip("pycolmap")
-    lens = FisheyeLens(640, 480, 230.0, (0.03, -0.008, 0.001, 0.0))
-    camera = pycolmap.Camera(model=lens.model, width=640, height=480, params=lens.params)
-    points = np.random.default_rng(1).uniform([[-1], [-0.8], [0.3]], [[1], [0.8], [1]], (3, 100))
-    assert np.allclose(camera.img_from_cam(points.T), lens.project(points).T, atol=1e-9)
 
 
 def test_lens_is_colmaps_opencv_model():

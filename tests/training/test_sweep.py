@@ -310,23 +310,6 @@ def test_a_dataset_without_points(dataset: Dataset) -> None:
     assert float(distance.abs().median()) < 0.03
 
 
-def test_the_result_does_not_depend_on_the_number_of_threads(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    threads = torch.get_num_threads()
-    clouds = []
-    try:
-        for n in (1, 3):
-            torch.set_num_threads(n)
-            monkeypatch.setattr("snowsplat.data.photos.image_loader.DECODERS", n)
-            random = torch.Generator().manual_seed(1)
-            clouds.append(swept_points(dataset, photos(dataset), 300, random))
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(clouds[0].xyz, clouds[1].xyz)
-    assert torch.equal(clouds[0].rgb, clouds[1].rgb)
-
-
 def test_dense_points_need_a_limit(dataset: Dataset) -> None:
     config = changed(TrainConfig(), init="points", initial_points=0.4)
     with pytest.raises(SettingError, match="max_gaussians"):

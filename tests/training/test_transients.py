@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat import Dataset, Gaussians, TrainConfig, Trainer, load_dataset, ops, recipe
+from snowsplat import Dataset, Gaussians, TrainConfig, Trainer, load_dataset, recipe
 from snowsplat.data.photos.decode import LoadedImage, load_image
 from snowsplat.evaluation.metrics import Rendering
 from snowsplat.scene.camera import Camera
@@ -392,17 +392,6 @@ def test_masks_are_used_also_if_the_rest_of_the_training_is_shorter(busy, traine
     view = SimpleNamespace(index=3)
     photo = LoadedImage(torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8))
     assert part.target(resumed, view, photo).mask is not None
-
-
-@pytest.mark.slow
-def test_the_masks_do_not_depend_on_the_number_of_threads(busy, early):
-    before = ops.get_num_threads()
-    ops.set_num_threads(1 if before > 1 else 2)
-    try:
-        again = run(busy, CONFIG, EARLY)
-    finally:
-        ops.set_num_threads(before)
-    assert_identical(again.gaussians, early.gaussians)
 
 
 def test_the_masks_of_another_dataset_are_rejected(busy):

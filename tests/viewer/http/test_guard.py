@@ -177,27 +177,6 @@ def test_the_number_of_websockets_is_limited(server, monkeypatch):
             assert time.monotonic() < end
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        clients.frame(b"", length=1 << 62),
-        clients.frame(b"", length=1 << 17),
-        clients.frame(b"x", opcode=11),
-    ],
-)
-def test_messages_that_are_too_long_or_invalid_end_a_websocket(server, data):
-    with clients.upgrade(server.url, "echo") as client:
-        with contextlib.suppress(OSError):
-            client.sendall(data)
-        client.settimeout(5)
-        with contextlib.suppress(ConnectionError):
-            while client.recv(1 << 16):
-                pass
-    with websocket(server, "echo") as socket:  # others are served
-        socket.send("hello")
-        assert socket.recv() == "hello"
-
-
 def test_a_websocket_that_does_not_read_is_disconnected(server, monkeypatch):
     monkeypatch.setattr(guard, "_SEND_SECONDS", 0.4)
     client = clients.upgrade(server.url, "flood")
