@@ -52,7 +52,7 @@ def test_trusted(wrong: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) 
 
 def test_info(wrong: Path, tmp_path: Path) -> None:
     facts = describe(wrong)
-    assert "field of view of 160°" in facts["impossible"][0]
+    assert "field of view of 160°" in str(facts["impossible"][0])
     right = describe(write_toy_dataset(tmp_path / "right", "colmap-bin", 9, 48, 36))
     assert (right["impossible"], right["doubtful"]) == ([], [])
 

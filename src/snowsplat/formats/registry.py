@@ -29,6 +29,7 @@ from snowsplat.formats.spz import is_spz, read_spz, spz_version, write_spz
 from snowsplat.formats.usd import is_usd, read_usd, write_usd
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import reading
+from snowsplat.util.messages import Message, message
 
 _HEAD_BYTES = 16_384
 
@@ -59,7 +60,7 @@ class Format:
     recognises: Callable[[bytes], bool] | None
     read: Callable[[Path], GaussianArrays] | None
     write: Callable[..., None] | None
-    loses: str
+    loses: Message
     marks_antialiased: bool = False
     version: Callable[[Path], str] | None = None
     stores_origin: bool = False
@@ -71,8 +72,8 @@ class Format:
         return self.bytes(path) if self.bytes else path.stat().st_size
 
 
-_UNMARKED = "the antialiased mark"
-_ROUNDED = f"nothing except for rounding and {_UNMARKED}"
+_UNMARKED = message("the antialiased mark")
+_ROUNDED = message("nothing except for rounding and the antialiased mark")
 
 #: ``recognises`` is called in this order: special formats are before general ones.
 FORMATS: list[Format] = [
@@ -82,18 +83,22 @@ FORMATS: list[Format] = [
         is_compressed_ply,
         read_compressed_ply,
         write_compressed_ply,
-        "precision: positions and scales have 10 to 11 bits, rotations 10, all other values 8",
+        message(
+            "precision: positions and scales have 10 to 11 bits, rotations 10, all other values 8"
+        ),
         True,
         stores_origin=True,
     ),
-    Format("PLY", (".ply",), is_ply, read_ply, write_ply, "nothing", True, stores_origin=True),
+    Format(
+        "PLY", (".ply",), is_ply, read_ply, write_ply, message("nothing"), True, stores_origin=True
+    ),
     Format(
         "SPZ",
         (".spz",),
         is_spz,
         read_spz,
         write_spz,
-        "precision: positions have 24 bits, rotations 10, SH 4 to 8, all other values 8",
+        message("precision: positions have 24 bits, rotations 10, SH 4 to 8, all other values 8"),
         True,
         spz_version,
     ),
@@ -113,7 +118,7 @@ FORMATS: list[Format] = [
         is_archive,
         read_archive,
         None,
-        "nothing that the file in it has",
+        message("nothing that the file in it has"),
         True,
         stores_origin=True,
     ),
@@ -123,7 +128,7 @@ FORMATS: list[Format] = [
         is_sog,
         read_sog,
         write_sog,
-        "precision: positions have 16 bits, all other values 8; SH are rows of a palette",
+        message("precision: positions have 16 bits, all other values 8; SH are rows of a palette"),
         True,
         sog_version,
         stores_origin=True,
@@ -134,7 +139,7 @@ FORMATS: list[Format] = [
         is_lod,
         read_lod,
         write_lod,
-        "precision: positions have 16 bits, all other values 8; SH are rows of palettes",
+        message("precision: positions have 16 bits, all other values 8; SH are rows of palettes"),
         True,
         stores_origin=True,
         bytes=lod_bytes,
@@ -165,8 +170,10 @@ FORMATS: list[Format] = [
         None,
         read_splat,
         write_splat,
-        f"all SH, {_UNMARKED}, colours beyond black and white; rotations, colours and "
-        "opacity have 8 bits",
+        message(
+            "all SH, the antialiased mark, colours beyond black and white; rotations, colours and "
+            "opacity have 8 bits"
+        ),
     ),
     Format(
         "ksplat",
@@ -174,7 +181,7 @@ FORMATS: list[Format] = [
         None,
         read_ksplat,
         None,
-        f"precision: SH have 8 to 32 bits, all other values 16 or 32; {_UNMARKED}",
+        message("precision: SH have 8 to 32 bits, all other values 16 or 32; the antialiased mark"),
     ),
     Format(
         "RAD",
@@ -182,7 +189,7 @@ FORMATS: list[Format] = [
         lambda head: head.startswith((b"RAD0", b"RADC")),
         None,
         None,
-        "not known",
+        message("not known"),
         instead="use the file that Spark made it from, or the .spz of its build-lod --unlod --spz",
     ),
     Format(
@@ -191,7 +198,7 @@ FORMATS: list[Format] = [
         None,
         None,
         None,
-        "not known",
+        message("not known"),
         instead="export the scene as .ply, or convert it with splat-transform",
     ),
 ]

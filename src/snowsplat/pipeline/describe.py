@@ -239,6 +239,6 @@ def _dataset(path: Path) -> dict[str, Any]:
         **({"origin": list(dataset.origin)} if any(dataset.origin) else {}),
         **({"metres_per_unit": metres} if (metres := dataset.metres_per_unit) else {}),
         "bounds": [_rounded(corner) for corner in dataset.bounds.tolist()],
-        "impossible": [finding.text for finding in findings if finding.impossible],
-        "doubtful": [finding.text for finding in findings if not finding.impossible],
+        "impossible": [finding.sentence for finding in findings if finding.impossible],
+        "doubtful": [finding.sentence for finding in findings if not finding.impossible],
     }

@@ -194,7 +194,7 @@ def _why_not(dataset: Dataset, without: int, photos: int) -> Message | None:
     """The reason why the poses are not used; None if they are."""
     impossible = [finding.text for finding in judge(dataset) if finding.impossible]
     if impossible:
-        return Message(impossible[0].rsplit(";", 1)[0])  # without the advice
+        return impossible[0]
     if without > (1 - _LEAST_SHARE) * photos:
         return message("{n} of {photos} photos have no pose", n=without, photos=photos)
     return None

@@ -164,7 +164,7 @@ class _Job:
         reset_peak()
         self.memory_before = resident_bytes()
         self.shards: Shards = ALONE
-        self.doubts: tuple[str, ...] = ()  # about the dataset
+        self.doubts: tuple[Message, ...] = ()  # about the dataset
 
     def train(self, path: Path | str) -> TrainResult:
         options = self.options
@@ -274,10 +274,13 @@ class _Job:
         """Warn if photos or masks were edited since the training has begun."""
         self.photos = stamps_of(dataset, path, meta.photos)
         if meta.photos is not None and (names := edited(meta.photos, self.photos)):
-            text = (
-                f"{len(names)} of {len(self.photos)} photos and masks were edited after the first "
-                f"step (such as {names[0]}); the result is not that of either version; train in a "
-                "new folder to use the edited ones only"
+            text = message(
+                "{edited} of {all} photos and masks were edited after the first step (such as "
+                "{name}); the result is not that of either version; train in a new folder to use "
+                "the edited ones only",
+                edited=len(names),
+                all=len(self.photos),
+                name=names[0],
             )
             self.doubts = (*self.doubts, text)
             logger.warning("warning: %s: %s", path, text)

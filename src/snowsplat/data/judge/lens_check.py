@@ -6,6 +6,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from snowsplat.util.messages import Message, message
+
 # Degrees, of the longer side of a photo. A pinhole image of more than 150° has less than a
 # seventh of its pixels within the central 60°: no lens is corrected to that. Below 5° (more than
 # 400 mm on a full-frame camera) are telescopes and satellites.
@@ -26,17 +28,25 @@ class Finding:
 
     Attributes:
         about: the quantity, in one or two words: "field of view", "axes".
-        text: one sentence with numbers, without a full stop. If ``impossible``, it also says what
-            to do, after a semicolon.
+        text: one sentence with numbers, without a full stop.
+        advice: what to do; None: not known.
         impossible: no real camera is like this, or the evidence is overwhelming. False: in doubt;
             the data may be unusual but right.
         photos: the views whose poses are wrong, if those of the others are right.
     """
 
     about: str
-    text: str
+    text: Message
+    advice: Message | None = None
     impossible: bool = False
     photos: tuple[str, ...] = ()
+
+    @property
+    def sentence(self) -> Message:
+        """The text and the advice."""
+        if self.advice is None:
+            return self.text
+        return message("{text}; {advice}", text=self.text, advice=self.advice)
 
 
 def field_of_view(size: float, focal: float) -> float:
@@ -56,24 +66,39 @@ def lens_findings(
     """
     found = []
     angle = max(field_of_view(width, fx), field_of_view(height, fy))
-    size = f"photos of {width}x{height}"
+    size = message("photos of {width}x{height}", width=width, height=height)
     if not _NARROWEST <= angle <= _WIDEST:
-        text = f"a focal length of {fx:.5g} pixels for {size} is a field of view of {angle:.3g}°"
+        text = message(
+            "a focal length of {fx:.5g} pixels for {size} is a field of view of {angle:.3g}°",
+            fx=fx,
+            size=size,
+            angle=angle,
+        )
         if angle > _WIDEST:
-            text += "; a pinhole camera has less than 150°; the focal length must be in pixels"
-        else:
-            text += "; the focal length must be in pixels of these photos"
+            text = message("{text}; a pinhole camera has less than 150°", text=text)
+        advice = message("the focal length must be in pixels of these photos")
         impossible = angle > _WIDEST or angle < _NARROWEST_TELESCOPE
-        found.append(Finding("field of view", text, impossible))
+        found.append(Finding("field of view", text, advice, impossible))
     if not _SQUARE[0] <= fx / fy <= _SQUARE[1]:
-        text = f"fx is {fx / fy:.3f} of fy, but pixels are square ({fx:.5g} and {fy:.5g})"
+        text = message(
+            "fx is {ratio:.3f} of fy, but pixels are square ({fx:.5g} and {fy:.5g})",
+            ratio=fx / fy,
+            fx=fx,
+            fy=fy,
+        )
         found.append(Finding("pixel aspect", text))
-    where = f"the principal point ({cx:.5g}, {cy:.5g})"
+    where = message("the principal point ({cx:.5g}, {cy:.5g})", cx=cx, cy=cy)
     off = max(abs(cx / width - 0.5), abs(cy / height - 0.5))
     if off > 0.5:
-        text = f"{where} is outside of {size}; it must be in pixels of these photos"
-        found.append(Finding("principal point", text, impossible=True))
+        text = message("{where} is outside of {size}", where=where, size=size)
+        advice = message("it must be in pixels of these photos")
+        found.append(Finding("principal point", text, advice, impossible=True))
     elif off > _OFF_CENTRE:
-        text = f"{where} is {off:.0%} of the size away from the centre of {size}"
+        text = message(
+            "{where} is {off:.0%} of the size away from the centre of {size}",
+            where=where,
+            off=off,
+            size=size,
+        )
         found.append(Finding("principal point", text))
     return found

@@ -16,6 +16,7 @@ from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import each_photo
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 # Masks that are decoded, spread over the dataset, and the longer side of their small copies.
 _MOST_MASKS, _SIDE = 16, 128
@@ -33,8 +34,10 @@ def mask_findings(views: Sequence[View], points: Points | None) -> list[Finding]
     if not used:
         return []
     if not any(mask.any() for _, mask in used):
-        nothing = f"the masks ignore every pixel of every photo ({len(used)} were looked at)"
-        return [Finding("masks", f"{nothing}; {INVERT}", impossible=len(masked) == len(views))]
+        nothing = message(
+            "the masks ignore every pixel of every photo ({count} were looked at)", count=len(used)
+        )
+        return [Finding("masks", nothing, INVERT, impossible=len(masked) == len(views))]
     looks = [look_of(mask) for _, mask in used]
     doubt = doubt_about_masks(looks, None if points is None else _points_kept(used, points))
     return [] if doubt is None else [Finding("masks", doubt)]

@@ -16,6 +16,7 @@ import torch
 
 from snowsplat.data.judge.rig import Rig
 from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
+from snowsplat.util.messages import Message, message
 
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
@@ -37,7 +38,7 @@ class Repair:
     """
 
     about: str
-    mistake: str
+    mistake: Message
     rig: Rig
     points: np.ndarray | None = None
 
@@ -61,78 +62,97 @@ def pose_repairs(rig: Rig) -> Iterator[Repair]:
     """Mistakes in the poses and lenses, which do not concern points. The usual ones come first."""
     yield Repair(
         "axes",
-        "the y and z axes of the cameras are flipped (transforms.json has OpenGL axes: y up, z "
-        "backward; COLMAP has OpenCV axes: y down, z forward)",
+        message(
+            "the y and z axes of the cameras are flipped (transforms.json has OpenGL axes: y up, z "
+            "backward; COLMAP has OpenCV axes: y down, z forward)"
+        ),
         _turned(rig, _OPENGL),
     )
     for before, after in product((np.eye(3), _OPENGL), repeat=2):
         yield Repair(
             "direction",
-            "the poses are inverted: world-to-camera where camera-to-world is expected, or the "
-            "reverse",
+            message(
+                "the poses are inverted: world-to-camera where camera-to-world is expected, or the "
+                "reverse"
+            ),
             _turned(_inverted(_turned(rig, before)), after),
         )
     for before, after in product((np.eye(3), _OPENGL), repeat=2):
         turned = _turned(rig, before)
         transposed = turned.rotation.transpose(0, 2, 1)
-        text = "the rotations of the poses are transposed"
+        text = message("the rotations of the poses are transposed")
         yield Repair("direction", text, _turned(turned.moved(transposed, turned.positions), after))
         kept = replace(turned, rotation=transposed)
         yield Repair("direction", text, _turned(kept, after))
     yield Repair(
         "positions",
-        "the translations of the poses are camera positions, where -R·position is expected",
+        message(
+            "the translations of the poses are camera positions, where -R·position is expected"
+        ),
         rig.moved(rig.rotation, rig.translation),
     )
     yield Repair(
         "positions",
-        "the positions of the poses are translations, where -R'·translation is expected",
+        message("the positions of the poses are translations, where -R'·translation is expected"),
         replace(rig, translation=rig.positions),
     )
-    for text, order in (
-        ("x y z w where w x y z is expected", (3, 0, 1, 2)),
-        ("w x y z where x y z w is expected", (1, 2, 3, 0)),
+    for given, expected, order in (
+        ("x y z w", "w x y z", (3, 0, 1, 2)),
+        ("w x y z", "x y z w", (1, 2, 3, 0)),
     ):
         quats = quat_from_rotation(torch.from_numpy(rig.rotation))[:, order]
         yield Repair(
             "quaternions",
-            f"the numbers of the quaternions are in the order {text}",
+            message(
+                "the numbers of the quaternions are in the order {given} where {expected} is "
+                "expected",
+                given=given,
+                expected=expected,
+            ),
             replace(rig, rotation=rotation_from_quat(quats).numpy()),
         )
     for axes in _ROTATIONS[1:]:
         yield Repair(
             "axes",
-            "the axes of the cameras are exchanged or flipped: x must be right, y down and z "
-            "forward in COLMAP models, and x right, y up and z backward in transforms.json",
+            message(
+                "the axes of the cameras are exchanged or flipped: x must be right, y down and z "
+                "forward in COLMAP models, and x right, y up and z backward in transforms.json"
+            ),
             _turned(rig, axes),
         )
+    mirrored = message("the poses are mirrored (a left-handed frame)")
     for axes in _ROTATIONS:
-        yield Repair("axes", "the poses are mirrored (a left-handed frame)", _mirrored(rig, axes))
+        yield Repair("axes", mirrored, _mirrored(rig, axes))
     yield from zooms(rig)
 
 
 def zooms(rig: Rig) -> Iterator[Repair]:
     """Other focal lengths."""
     for factor in _ZOOMS:
-        text = f"the focal length is {_times(1 / factor)} the right one"
+        text = message("the focal length is {times} the right one", times=_times(1 / factor))
         yield Repair("focal length", text, rig.zoomed(factor))
 
 
 def point_repairs(rig: Rig) -> Iterator[Repair]:
     """Mistakes in the frame of the points against that of the poses."""
     for axes in _AXES[1:]:
-        kind = "exchanged or flipped" if np.linalg.det(axes) > 0 else "mirrored"
-        text = f"the axes of the points are {kind} against those of the poses"
+        text = message("the axes of the points are mirrored against those of the poses")
+        if np.linalg.det(axes) > 0:
+            text = message(
+                "the axes of the points are exchanged or flipped against those of the poses"
+            )
         yield Repair("points", text, rig, axes)
     for factor in _UNITS:
-        text = f"the unit of the poses is {_times(factor)} that of the points"
+        text = message("the unit of the poses is {times} that of the points", times=_times(factor))
         yield Repair("units", text, rig, factor * np.eye(3))
 
 
-def _times(factor: float) -> str:
+def _times(factor: float) -> Message:
     """ "3 times" or "1/3 of", with two digits."""
     number = float(f"{max(factor, 1 / factor):.2g}")
-    return f"{number:,g} times" if factor >= 1 else f"1/{number:,g} of"
+    if factor >= 1:
+        return message("{number:,g} times", number=number)
+    return message("1/{number:,g} of", number=number)
 
 
 def _turned(rig: Rig, axes: np.ndarray) -> Rig:

@@ -34,6 +34,7 @@ from snowsplat.data.judge.match_evidence import Fit, MatchEvidence, PhotoSample
 from snowsplat.data.judge.repairs import Repair, point_repairs, pose_repairs
 from snowsplat.data.judge.rig import Rig
 from snowsplat.scene.origin import HERE
+from snowsplat.util.messages import Message, message
 from snowsplat.util.names import first_names
 from snowsplat.util.natural_order import natural_key
 
@@ -91,10 +92,6 @@ _POINTS_TO_TRY = 2000
 # float32, with a relative error of 6e-8. At a distance of 2000 extents this is a tenth of a pixel
 # of a photo with 1000 pixels; at 50,000 it is some pixels.
 _ROUNDED, _LOST = 2e3, 5e4
-_LOST_DIGITS = (
-    "the poses were too far from the origin, and lost digits; move the scene to the origin in the "
-    "program that made the poses, and export it again"
-)
 
 
 def judge(dataset: Dataset) -> list[Finding]:
@@ -132,7 +129,10 @@ def _lenses(views: list[View]) -> list[Finding]:
     return [
         Finding(
             finding.about,
-            finding.text if count == len(views) else f"{count} photos: {finding.text}",
+            finding.text
+            if count == len(views)
+            else message("{count} photos: {text}", count=count, text=finding.text),
+            finding.advice,
             finding.impossible,
         )
         for finding, count in found.values()
@@ -149,16 +149,22 @@ def _positions(rig: Rig) -> list[Finding]:
     distance = float(np.linalg.norm(middle))
     # Positions are computed from rotations and translations, with rounding errors.
     if extent <= 1e-9 * max(distance, np.abs(rig.translation).max(), 1e-30):
-        text = f"all {len(rig)} cameras are at one place, so the photos show no depth"
+        text = message(
+            "all {count} cameras are at one place, so the photos show no depth", count=len(rig)
+        )
         return [Finding("positions", text)]
     if distance > _ROUNDED * extent:
-        text = (
-            f"the cameras are {distance:,.0f} units away from the origin, and {extent:.3g} from "
-            f"each other, which 32-bit numbers cannot resolve; subtract "
-            f"({', '.join(f'{value:.0f}' for value in middle)}) from the positions of cameras and "
-            "points"
+        text = message(
+            "the cameras are {distance:,.0f} units away from the origin, and {extent:.3g} from "
+            "each other, which 32-bit numbers cannot resolve",
+            distance=distance,
+            extent=extent,
         )
-        return [Finding("origin", text, impossible=distance > _LOST * extent)]
+        advice = message(
+            "subtract ({middle}) from the positions of cameras and points",
+            middle=", ".join(f"{value:.0f}" for value in middle),
+        )
+        return [Finding("origin", text, advice, impossible=distance > _LOST * extent)]
     return []
 
 
@@ -255,14 +261,17 @@ class _Evidence:
 
 def _poses(evidence: _Evidence) -> list[Finding]:
     """What the matches and colours say about the poses, and about the frame of the points."""
-    texts = []
+    because = Message("")
     if evidence.fit.nats.size:
-        share = f"{evidence.fit.agreeing:.0%} of the pairs of photos"
-        away = f"typically {evidence.fit.noise:.2%} of their size away from where the poses say"
-        texts.append(f"the matches of {share} agree with the poses, {away}")
+        because = message(
+            "the matches of {share:.0%} of the pairs of photos agree with the poses, typically "
+            "{noise:.2%} of their size away from where the poses say",
+            share=evidence.fit.agreeing,
+            noise=evidence.fit.noise,
+        )
     if evidence.agreement is not None and evidence.seen < 0:
-        texts.append(_of_colours(evidence.agreement))
-    because = ", and ".join(texts)
+        colours = _of_colours(evidence.agreement)
+        because = message("{one}, and {other}", one=because, other=colours) if because else colours
     is_exact = evidence.fit.noise <= _INEXACT
     matched = evidence.odds > 0 and is_exact
     if repairs := evidence.repaired():
@@ -274,16 +283,27 @@ def _poses(evidence: _Evidence) -> list[Finding]:
             return [_mistake(repair, because, impossible=True)]
     disorder = not matched and evidence.odds + evidence.seen < -_TOLD
     if evidence.far and (disorder or not is_exact or not evidence.minority):
-        return [Finding("poses", f"{because}; {_LOST_DIGITS}", impossible=True)]
+        text = message(
+            "{because}; the poses were too far from the origin, and lost digits", because=because
+        )
+        advice = message(
+            "move the scene to the origin in the program that made the poses, and export it again"
+        )
+        return [Finding("poses", text, advice, impossible=True)]
     if disorder:
         return [_disorder(because, impossible=evidence.odds < -_OVERWHELMING)]
     if not is_exact:
-        text = f"{because}; the poses are inexact, or belong to other photos"
+        text = message(
+            "{because}; the poses are inexact, or belong to other photos", because=because
+        )
         return [Finding("poses", text)]
     found = [_frames(evidence)] if evidence.wrong else []
     agreement = evidence.agreement
     if agreement is not None and evidence.seen < -_TOLD and agreement.correlation < _COLOURS_FIT:
-        text = f"{_of_colours(agreement)}; the points may be in another frame than the poses"
+        text = message(
+            "{because}; the points may be in another frame than the poses",
+            because=_of_colours(agreement),
+        )
         found.append(Finding("points", text))
     return found
 
@@ -291,44 +311,55 @@ def _poses(evidence: _Evidence) -> list[Finding]:
 def _frames(evidence: _Evidence) -> Finding:
     """Photos whose own matches contradict their poses."""
     photos = tuple(evidence.names[i] for i in evidence.wrong)
-    text = f"the poses of {first_names(photos, 5)} contradict their matches with other photos"
+    text = message(
+        "the poses of {photos} contradict their matches with other photos",
+        photos=first_names(photos, 5),
+    )
     if evidence.minority:
-        return Finding("poses", f"{text}; a training leaves them out", photos=photos)
-    return Finding("poses", f"{text}; estimate the poses again")
+        return Finding("poses", text, message("a training leaves them out"), photos=photos)
+    return Finding("poses", text, message("estimate the poses again"))
 
 
 def _tracks(count: int, off: Sequence[float], *, far: bool) -> Finding:
     """Photos in which the points are not where they were observed."""
     distance = float(np.median(off))
-    place = (
-        "behind the camera"
-        if np.isinf(distance)
-        else f"{distance:.1%} of the size of the photo away from where it was observed"
+    place = message("behind the camera")
+    if np.isfinite(distance):
+        place = message(
+            "{distance:.1%} of the size of the photo away from where it was observed",
+            distance=distance,
+        )
+    text = message(
+        "poses and points do not fit each other: in {off} of {count} photos, a typical point is "
+        "{place}; they were changed, or lost digits, after the reconstruction",
+        off=len(off),
+        count=count,
+        place=place,
     )
-    text = (
-        f"poses and points do not fit each other: in {len(off)} of {count} photos, a "
-        f"typical point is {place}; they were changed, or lost digits, after the "
-        "reconstruction; export both again, in one frame near the origin"
-    )
-    return Finding("poses", text, impossible=far)
+    advice = message("export both again, in one frame near the origin")
+    return Finding("poses", text, advice, impossible=far)
 
 
-def _of_colours(agreement: Agreement) -> str:
+def _of_colours(agreement: Agreement) -> Message:
     if agreement.judged == 0:
-        return "the points are not in front of the cameras"
-    return (
-        f"the points have other colours than the photos where the cameras see them (correlation "
-        f"{agreement.correlation:.2f})"
+        return message("the points are not in front of the cameras")
+    return message(
+        "the points have other colours than the photos where the cameras see them (correlation "
+        "{correlation:.2f})",
+        correlation=agreement.correlation,
     )
 
 
-def _mistake(repair: Repair, evidence: str, *, impossible: bool) -> Finding:
-    return Finding(repair.about, f"{evidence}; {repair.mistake}; correct the dataset", impossible)
+def _mistake(repair: Repair, evidence: Message, *, impossible: bool) -> Finding:
+    text = message("{evidence}; {mistake}", evidence=evidence, mistake=repair.mistake)
+    return Finding(repair.about, text, message("correct the dataset"), impossible)
 
 
-def _disorder(evidence: str, *, impossible: bool) -> Finding:
-    text = (
-        f"{evidence}; the poses may belong to other photos, or their axes or focal lengths are "
-        "wrong"
+def _disorder(evidence: Message, *, impossible: bool) -> Finding:
+    text = message(
+        "{evidence}; the poses may belong to other photos, or their axes or focal lengths are "
+        "wrong",
+        evidence=evidence,
     )
-    return Finding("poses", f"{text}; export them again" if impossible else text, impossible)
+    advice = message("export them again") if impossible else None
+    return Finding("poses", text, advice, impossible)

@@ -15,6 +15,7 @@ from PIL import Image
 
 from snowsplat.data.photos.colour_profile import is_transparent
 from snowsplat.data.photos.image_file import open_image, scaled_size
+from snowsplat.util.messages import Message, message
 
 # The share of a typical photo below which hardly anything is used.
 _LITTLE = 0.05
@@ -29,7 +30,9 @@ _FEWER_POINTS = 0.25
 # Mask files that are decoded to judge all.
 _SAMPLE = 16
 #: What to do about masks that are the wrong way round.
-INVERT = "black pixels of a mask are ignored: if black marks what to keep, invert the masks"
+INVERT = message(
+    "black pixels of a mask are ignored: if black marks what to keep, invert the masks"
+)
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,9 @@ def look_of(used: np.ndarray) -> MaskLook:
     return MaskLook(*(round(float(part.mean()), 4) for part in (used, middle, rim)))
 
 
-def doubt_about_masks(looks: Sequence[MaskLook], points_kept: float | None = None) -> str | None:
+def doubt_about_masks(
+    looks: Sequence[MaskLook], points_kept: float | None = None
+) -> Message | None:
     """What is doubtful about masks, in one sentence; None if nothing is.
 
     Args:
@@ -64,19 +69,29 @@ def doubt_about_masks(looks: Sequence[MaskLook], points_kept: float | None = Non
         return None
     kept = float(np.median([look.kept for look in looks]))
     if kept < _LITTLE:
-        return f"the masks ignore {_percent(1 - kept)} of a typical photo; {INVERT}"
+        return message(
+            "the masks ignore {share} of a typical photo; {invert}",
+            share=_percent(1 - kept),
+            invert=INVERT,
+        )
     if points_kept is not None and points_kept < _FEWER_POINTS * kept:
-        return (
-            f"the masks keep {_percent(kept)} of a typical photo, but only {_percent(points_kept)} "
-            f"of the points of the model are there; {INVERT}"
+        return message(
+            "the masks keep {share} of a typical photo, but only {points} of the points of the "
+            "model are there; {invert}",
+            share=_percent(kept),
+            points=_percent(points_kept),
+            invert=INVERT,
         )
     around = sum(look.middle <= _IGNORED and look.border >= _KEPT for look in looks)
     if len(looks) >= _FEWEST_MASKS and around >= _MOST_PHOTOS * len(looks):
-        return f"the masks keep the border of most photos and ignore their middle; {INVERT}"
+        return message(
+            "the masks keep the border of most photos and ignore their middle; {invert}",
+            invert=INVERT,
+        )
     return None
 
 
-def doubt_about_files(masks: Sequence[Path]) -> str | None:
+def doubt_about_files(masks: Sequence[Path]) -> Message | None:
     """What is doubtful about mask files, by a sample; files that cannot be read are left out."""
     chosen = np.unique(np.linspace(0, len(masks) - 1, min(len(masks), _SAMPLE)).astype(int))
     looks = []

@@ -23,6 +23,7 @@ from snowsplat.formats import (
 from snowsplat.formats.lod import lod_bytes, read_index
 from snowsplat.formats.lod_writer import write_lod
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.util.messages import message
 from snowsplat.util.stages import Outcome
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ register_format(
         None,
         None,
         _write_html,
-        "the same as in SOG",
+        message("the same as in SOG"),
         True,
         instead="use the scene file that the page was made from",
     )

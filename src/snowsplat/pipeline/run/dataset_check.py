@@ -17,6 +17,7 @@ from snowsplat.data import Dataset
 from snowsplat.data.judge.verdict import judge
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import Message
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +104,7 @@ def hash_of_files(dataset: DatasetFolder) -> str:
 
 def check_cameras(
     dataset: Dataset, path: str, *, trusted: bool = False
-) -> tuple[tuple[str, ...], list[str]]:
+) -> tuple[tuple[Message, ...], list[str]]:
     """Judge the cameras of a dataset; see `snowsplat.data.judge.verdict.judge`.
 
     Args:
@@ -121,10 +122,10 @@ def check_cameras(
             raise UserError(
                 "{path}: {text} (or set `trust_cameras` if you are sure)",
                 path=path,
-                text=finding.text,
+                text=finding.sentence,
             )
     for finding in findings:
-        logger.warning("warning: %s: %s", path, finding.text)
+        logger.warning("warning: %s: %s", path, finding.sentence)
     wrong = {name for finding in findings if not trusted for name in finding.photos}
     views = [view for view in [*dataset.train, *dataset.test] if view.name in wrong]
-    return tuple(finding.text for finding in findings), sorted({view.photo for view in views})
+    return tuple(finding.sentence for finding in findings), sorted({view.photo for view in views})

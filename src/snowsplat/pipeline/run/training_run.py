@@ -83,7 +83,7 @@ class TrainingRun:
     memory_before: int  # see `MemoryPlan.peak`
     budget: TimeBudget | None  # None: no time budget
     pace: Pace
-    doubts: tuple[str, ...] = ()  # what is doubtful about the dataset, for the report
+    doubts: tuple[Message, ...] = ()  # what is doubtful about the dataset, for the report
     photos: dict[str, Stamp] | None = None  # stamps of the photos and masks, for checkpoints
 
     def __post_init__(self) -> None:

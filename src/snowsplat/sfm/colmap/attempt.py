@@ -70,7 +70,7 @@ class Attempt:
     models: list[pycolmap.Reconstruction]
     agreement: float  # of the first model with its matches; see `agreement_of`
     excluded: dict[str, Message]  # name -> reason, for photos that had a pose in a wrong place
-    doubts: list[str]  # about the lenses, as text for users
+    doubts: list[Message]  # about the lenses
     description: str  # as text for users
 
     @property
@@ -152,7 +152,7 @@ class AttemptRunner:
             models = mapping.extend(models)
             added = models[0].num_reg_images() - before
             weak = f", {added} of them with weak matches" if added else ""
-        check, excluded, doubts, agreement = "", dict[str, Message](), list[str](), 0.0
+        check, excluded, doubts, agreement = "", dict[str, Message](), list[Message](), 0.0
         if models:
             repaired = repair(models[0], mapping, matched.max_error)
             excluded = repaired.excluded
@@ -165,7 +165,7 @@ class AttemptRunner:
                 models = usable_models([model, *models[1:]])
             else:
                 models = []
-                check = f"; impossible: {', '.join(doubts)}"
+                check = f"; impossible: {', '.join(map(str, doubts))}"
         if models:
             pairs = repaired.pairs if models[0] is repaired.model else None
             agreement = agreement_of_model(models[0], matched.database, matched.max_error, pairs)

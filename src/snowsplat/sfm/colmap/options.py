@@ -34,8 +34,8 @@ class SfmResult:
     cameras: list[dict[str, Any]]
     pairs: str  # how the pairs of photos to match were chosen, as text for users
     attempts: list[str]  # a description of each attempt, as text for users, in order
-    # What is in doubt about the lenses, as text for users; earlier versions did not have this.
-    doubts: list[str] = field(default_factory=list)
+    # What is in doubt about the poses and lenses; earlier versions did not have this.
+    doubts: list[Message] = field(default_factory=list)
     # The focal lengths, as text for users, if those of photos of one group differ (`Photo.group`).
     zooms: str = ""
     # How well the poses agree with the matches where they agree least: 0 to 1

@@ -50,6 +50,7 @@ from snowsplat.sfm.colmap.pairs.choice import PairChoice
 from snowsplat.sfm.colmap.result import names_in, result_of
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import Mapper, SfmOptions
+from snowsplat.util.messages import Message, message
 
 _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
 # The expected time from the start of the job to the end of the next attempt, divided by the time
@@ -123,8 +124,11 @@ class PoseEstimation:
         doubts = list(best.doubts)
         if best.agreement < CONSISTENT:
             doubts.append(
-                f"the poses may be bent: where they fit least, {best.agreement:.0%} of the matches "
-                "between neighbouring photos agree with them"
+                message(
+                    "the poses may be bent: where they fit least, {share:.0%} of the matches "
+                    "between neighbouring photos agree with them",
+                    share=best.agreement,
+                )
             )
         return result_of(
             models,
@@ -283,7 +287,7 @@ class PoseEstimation:
             "with any ordinary lens"
         )
 
-    def _doubt_about_fisheye(self, best: Attempt) -> list[str]:
+    def _doubt_about_fisheye(self, best: Attempt) -> list[Message]:
         """A doubt, if the photos seem to be from a fisheye lens, but the model has an ordinary one.
 
         The model FOV describes fisheye lenses, too. An endoscope shows a disc without one: if poses
@@ -295,8 +299,10 @@ class PoseEstimation:
         if not disc and not any(evidence.fisheye for evidence in self.lens_evidence.values()):
             return []
         return [
-            "the photos seem to be from a fisheye lens, but their poses were estimated with an "
-            "ordinary one; state the camera model OPENCV_FISHEYE"
+            message(
+                "the photos seem to be from a fisheye lens, but their poses were estimated with an "
+                "ordinary one; state the camera model OPENCV_FISHEYE"
+            )
         ]
 
     def _best(self) -> Attempt:

@@ -52,7 +52,7 @@ class Trained:
     left_out: tuple[str, ...] = ()  # names of the training views that the training has left out
     parts: Sequence[PartReport] = ()  # what the parts of the training report
     # What is doubtful about the cameras of the dataset, a sentence each.
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Message, ...] = ()
     verdict: Verdict | None = None  # the verdict on the scene; None if no photos were held out
     peak_bytes: int = 0  # peak memory; 0 if unknown
     of_make: bool = False  # whether `make` trains the scene

@@ -96,7 +96,7 @@ def test_a_lens_whose_picture_is_a_disc_begins_near_its_focal_length(tmp_path):
     assert camera.mean_focal_length() == pytest.approx(WIDE.focal, rel=0.01)
     # The matches of an ordinary attempt, which contradict its poses, do not hide the disc.
     bent = SimpleNamespace(lens=Lens(), agreement=0.75)
-    assert "from a fisheye lens, but" in job._doubt_about_fisheye(bent)[0]
+    assert "from a fisheye lens, but" in str(job._doubt_about_fisheye(bent)[0])
     assert job._doubt_about_fisheye(SimpleNamespace(lens=Lens(), agreement=0.99)) == []
     found = job._describe_fisheye(SimpleNamespace(lens=lens))
     assert found == "the photos are from a fisheye lens: the picture is a disc"
@@ -136,7 +136,7 @@ def test_fisheye_lenses_of_real_cameras_are_possible(model, params):
 )
 def test_a_wrong_lens_is_named(model, params, message):
     (found,) = findings_of(camera(model, params))
-    assert message in found.text
+    assert message in str(found.sentence)
 
 
 def test_matches_behind_the_camera_agree_with_their_pose():

@@ -134,10 +134,10 @@ def explain(
     return reasons
 
 
-def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
+def failure(evidence: Evidence, doubts: Sequence[Message] = ()) -> UserError:
     """The error to raise if no model was found: the reason, and what to do about it.
 
-    ``doubts``: why a model was rejected, as text for users.
+    ``doubts``: why a model was rejected.
     """
     count = len(evidence.features)
     usable = sum(features >= _FEW_FEATURES for features in evidence.features)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from snowsplat.data.judge.lens_check import Finding, lens_findings
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.util.messages import Message, message
 
 # With fewer photos, the eight parameters of the camera model OPENCV are not well determined.
 _MIN_PHOTOS_FOR_OPENCV = 8
@@ -59,6 +60,7 @@ _EQUAL_ERROR = 0.05
 _MAX_WORSE = 2.0
 # The estimated focal length is in doubt if it differs from that in EXIF by more than this share.
 _NEAR_EXIF = 0.1
+_FOLDED = message("the lens distortion is not one-to-one over the whole photo")
 
 
 @dataclass(frozen=True)
@@ -220,26 +222,34 @@ def findings_of(camera: pycolmap.Camera) -> list[Finding]:
     else:
         reason = _implausible_distortion(camera)
     if reason:
-        return [*found, Finding("distortion", reason, True)]
+        return [*found, Finding("distortion", reason, impossible=True)]
     moved = barrel(camera)
     if moved < -_MAX_BARREL:
         found.append(
             Finding(
                 "distortion",
-                f"the lens distortion moves pixels at the border by {moved:.0%}, as a fisheye "
-                "lens does; if it is one, state the camera model OPENCV_FISHEYE",
+                message(
+                    "the lens distortion moves pixels at the border by {moved:.0%}, as a fisheye "
+                    "lens does",
+                    moved=moved,
+                ),
+                message("if it is one, state the camera model OPENCV_FISHEYE"),
             )
         )
     return found
 
 
-def _implausible_fisheye(camera: pycolmap.Camera) -> str:
-    """Why a fisheye lens is not that of a camera, as text; empty: it is plausible."""
+def _implausible_fisheye(camera: pycolmap.Camera) -> Message | None:
+    """Why a fisheye lens is not that of a camera; None: it is plausible."""
     half = 0.5 * min(camera.width, camera.height) / camera.mean_focal_length()
     if half > np.radians(_WIDEST_HALF):
-        return (
-            f"a focal length of {camera.mean_focal_length():.5g} pixels for photos of "
-            f"{camera.width}x{camera.height} is a field of view of {np.degrees(2 * half):.0f}°"
+        return message(
+            "a focal length of {fx:.5g} pixels for photos of {width}x{height} is a field of view "
+            "of {angle:.0f}°",
+            fx=camera.mean_focal_length(),
+            width=camera.width,
+            height=camera.height,
+            angle=np.degrees(2 * half),
         )
     angle, turn = np.radians(np.arange(0.5, _MAX_ANGLE, 0.5)), np.arange(16) * (2 * np.pi / 16)
     sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
@@ -250,8 +260,8 @@ def _implausible_fisheye(camera: pycolmap.Camera) -> str:
     radius = np.linalg.norm(pixels - centre, axis=-1)
     # A distortion that folds moves pixels back into the photo.
     if np.any(inside[:-1] & ~(radius[1:] > radius[:-1])):
-        return "the lens distortion is not one-to-one over the whole photo"
-    return ""
+        return _FOLDED
+    return None
 
 
 def barrel(camera: pycolmap.Camera) -> float:
@@ -266,14 +276,14 @@ def barrel(camera: pycolmap.Camera) -> float:
     return float(distorted / np.linalg.norm(ideal, axis=1).max() - 1)
 
 
-def _implausible_distortion(camera: pycolmap.Camera) -> str:
-    """Why the distortion is not that of a lens, as text; empty: it is plausible. Fisheye models and
+def _implausible_distortion(camera: pycolmap.Camera) -> Message | None:
+    """Why the distortion is not that of a lens; None: it is plausible. Fisheye models and
     models without distortion are plausible."""
     if not camera.is_perspective_pinhole() or camera.is_undistorted():
-        return ""
+        return None
     ideal = _border(camera)
     if not np.isfinite(ideal).all():
-        return "the lens distortion is not one-to-one over the whole photo"
+        return _FOLDED
     # Along rays from the principal point to the border, in units of the focal length.
     steps = np.linspace(0.0, 1.0, 33)[1:]
     rays = np.concatenate([ideal[:, None] * steps[:, None], np.ones((len(ideal), 32, 1))], 2)
@@ -284,21 +294,24 @@ def _implausible_distortion(camera: pycolmap.Camera) -> str:
     radius = np.linalg.norm(ideal, axis=1)[:, None] * steps
     slope = np.diff(distorted, axis=1) / np.diff(radius, axis=1)
     if not np.isfinite(slope).all() or slope.min() <= 0:
-        return "the lens distortion is not one-to-one over the whole photo"
+        return _FOLDED
     displaced = distorted / radius - 1
     fisheye = np.arctan(radius) / radius - 1
     if displaced.max() > _MAX_DISPLACEMENT or (displaced - fisheye).min() < -_MAX_DISPLACEMENT:
         worst = max(displaced.min(), displaced.max(), key=abs)
-        return f"the lens distortion moves pixels at the border by {worst:.0%}"
+        return message("the lens distortion moves pixels at the border by {moved:.0%}", moved=worst)
     rise, fall = displaced.max(1) - displaced[:, 0], displaced.max(1) - displaced[:, -1]
     if np.minimum(rise, fall).max() > _MAX_MOUSTACHE:
-        return (
-            f"the lens distortion moves pixels outwards by {rise.max():.1%}, but those at the "
-            f"border inwards"
+        return message(
+            "the lens distortion moves pixels outwards by {rise:.1%}, but those at the border "
+            "inwards",
+            rise=rise.max(),
         )
     if slope.max() > _MAX_STRETCH:
-        return f"the lens distortion enlarges a part of the photo {slope.max():.1f} times"
-    return ""
+        return message(
+            "the lens distortion enlarges a part of the photo {times:.1f} times", times=slope.max()
+        )
+    return None
 
 
 def _border(camera: pycolmap.Camera) -> NDArray[np.floating[Any]]:
@@ -315,7 +328,7 @@ class Settled:
 
     model: pycolmap.Reconstruction | None  # None: no possible lens agrees with the matches
     held: bool  # whether the focal length is held from now on
-    notes: list[str]  # what is in doubt about the lens, as text for users
+    notes: list[Message]  # what is in doubt about the lens
 
 
 #: `Mapping.with_cameras`.
@@ -355,17 +368,21 @@ def settle_lens(
     return Settled(None if _impossible(free) else free, False, _doubts(free, known))
 
 
-def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[str]:
-    """What is wrong or in doubt about the lenses of a model, as text for users."""
+def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[Message]:
+    """What is wrong or in doubt about the lenses of a model."""
     found = []
     for number in used_cameras(model):
         camera = model.cameras[number]
-        found += [finding.text for finding in findings_of(camera)]
+        found += [finding.sentence for finding in findings_of(camera)]
         exif, focal = known.get(number), camera.mean_focal_length()
         if exif and not 1 / (1 + _NEAR_EXIF) < focal / exif < 1 + _NEAR_EXIF:
             found.append(
-                f"the focal length in EXIF ({exif:.0f} pixels) does not agree with the photos "
-                f"({focal:.0f} pixels); the latter is used"
+                message(
+                    "the focal length in EXIF ({exif:.0f} pixels) does not agree with the photos "
+                    "({focal:.0f} pixels); the latter is used",
+                    exif=exif,
+                    focal=focal,
+                )
             )
     return list(dict.fromkeys(found))
 

@@ -146,7 +146,8 @@ def _run(job: dict[str, Any], log: Path, threads: int, watchers: _Watchers) -> S
         return code
     result = answer["result"]
     reasons = {name: as_message(why) for name, why in result["unregistered"].items()}
-    return SfmResult(**result | {"unregistered": reasons})
+    doubts = [as_message(doubt) for doubt in result["doubts"]]
+    return SfmResult(**result | {"unregistered": reasons, "doubts": doubts})
 
 
 def _communicate(
