@@ -25,7 +25,6 @@ from snowsplat.data import load_dataset
 from snowsplat.data.photos.decode import ImageSource, load_image, read_header
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.formats.spz_container import Header, pack
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.sfm import make_dataset
@@ -98,13 +97,6 @@ def tiff(entries: list[tuple[int, int, int, int]], data: bytes) -> bytes:
     return b"II*\0\x08\0\0\0" + struct.pack("<H", len(entries)) + body + bytes(4) + data
 
 
-def tiff_of_one_tile(side: int) -> bytes:
-    start = 8 + 2 + 12 * 11 + 4
-    sizes = [(256, 4, 1, 64), (257, 4, 1, 64), (258, 3, 1, 8), (259, 3, 1, 8), (262, 3, 1, 1)]
-    tile = [(277, 3, 1, 1), (284, 3, 1, 1), (322, 4, 1, side), (323, 4, 1, side)]
-    return tiff([*sizes, *tile, (324, 4, 1, start), (325, 4, 1, 100)], zlib.compress(bytes(99999)))
-
-
 def jpeg_of_scans(side: int, scans: int, between: bytes = b"") -> bytes:
     """A progressive JPEG that repeats its last scan. Each scan has few bytes but all pixels."""
     packed = io.BytesIO()
@@ -112,19 +104,6 @@ def jpeg_of_scans(side: int, scans: int, between: bytes = b"") -> bytes:
     data = packed.getvalue()
     last = data.rfind(b"\xff\xda")
     return data[:-2] + between + data[last:-2] * scans + b"\xff\xd9"
-
-
-def png_of_chunks(count: int) -> bytes:
-    """A PNG with empty chunks before its pixels. Skipping a chunk takes microseconds."""
-    data = png(64, 64)
-    empty = struct.pack(">I", 0) + b"juNk" + struct.pack(">I", zlib.crc32(b"juNk"))
-    return data[:33] + empty * count + data[33:]
-
-
-def jpeg_after(junk: bytes) -> bytes:
-    packed = io.BytesIO()
-    Image.new("RGB", (64, 64)).save(packed, "JPEG")
-    return packed.getvalue()[:2] + junk + packed.getvalue()[2:]
 
 
 @pytest.mark.parametrize(
@@ -136,21 +115,9 @@ def jpeg_after(junk: bytes) -> bytes:
         ("long.bmp", lambda: bmp_that_skips(90_000_000), "65,535 a side"),
         ("slow.ppm", lambda: b"P6 2000 2000 254\n" + bytes(12_000_000), "slow to read"),
         ("text.ppm", lambda: b"P3 2000 2000 255\n" + b"0 " * 12_000_000, "slow to read"),
-        ("tile.tif", lambda: tiff_of_one_tile(46_000), "tiles larger than the image"),
         ("scans.jpg", lambda: jpeg_of_scans(4000, 2000), "too many scans"),
         # A marker without a length. A parser that expects a length misses the next marker.
         ("tem.jpg", lambda: jpeg_of_scans(4000, 2000, b"\xff\x01"), "too many scans"),
-        ("chunks.png", lambda: png_of_chunks(5_000_000), "too many chunks"),
-        (
-            "segments.jpg",
-            lambda: jpeg_after(b"\xff\xe5\0\x02" * 15_000_000),
-            "too many segments",
-        ),
-        (
-            "padded.jpg",
-            lambda: jpeg_after(b"\xff" * 60_000_000),
-            "too many bytes before its pixels",
-        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore")
@@ -196,15 +163,6 @@ def test_scans_are_not_counted_in_a_video_after_a_photo(tmp_path):
 
 
 # Scenes
-
-
-def test_spz_of_equal_gaussians(tmp_path, rejected):
-    path, n = tmp_path / "a.spz", 1_000_000
-    columns = [bytes(width * n) for width in (9, 1, 3, 3, 4, 45)]
-    for version in (3, 4):
-        path.write_bytes(pack(Header(version, n, 3, 12, 0), columns))
-        assert path.stat().st_size < 100_000
-        assert "declares 1000000 Gaussians" in rejected(lambda: read_gaussians(path))
 
 
 @pytest.fixture
@@ -357,23 +315,6 @@ def test_transforms_with_a_file_outside(tmp_path, dataset, key, number):
     assert all(file.is_relative_to(home) and file.name != "secret.png" for file in used)
 
 
-def test_transforms_with_points_outside(tmp_path, rejected, dataset):
-    home = dataset("blender")
-    path = home / "transforms_train.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "../a.ply"}))
-    assert "is not in the folder" in rejected(lambda: load_dataset(home))
-
-
-def test_absolute_paths_inside_the_dataset_are_accepted(dataset):
-    home = dataset("blender")
-    path = home / "transforms_train.json"
-    scene = json.loads(path.read_text())
-    for frame in scene["frames"]:
-        frame["file_path"] = str((home / frame["file_path"]).absolute())
-    path.write_text(json.dumps(scene))
-    assert len(load_dataset(home, hold_out=None).train) == 5
-
-
 def test_colmap_text_with_a_huge_line(tmp_path, rejected, dataset):
     home = dataset("colmap-txt")
     images = home / "sparse/0/images.txt"
@@ -385,12 +326,6 @@ def test_colmap_text_with_a_huge_line(tmp_path, rejected, dataset):
     write_toy_dataset(home, "colmap-txt", 5, 32, 24, n_points=20)
     cameras.write_text(cameras.read_text().replace("PINHOLE", "x" * 100_000))
     assert "unknown camera model" in rejected(lambda: load_dataset(home))
-
-
-def test_colmap_with_too_many_images(tmp_path, rejected, dataset):
-    home = dataset("colmap-txt")
-    (home / "sparse/0/images.txt").write_text("1 1 0 0 0 0 0 0 1 a\n\n" * 210_000)
-    assert "more than 200,000 images" in rejected(lambda: load_dataset(home))
 
 
 def test_colmap_text_with_many_points_takes_little_memory(tmp_path, dataset):

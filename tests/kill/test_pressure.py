@@ -346,10 +346,3 @@ def test_a_narrow_terminal(runner, place, trained, dataset, photos):
     ended = runner.run(["train", dataset, "-o", place / "t", *CPU], columns=24)
     assert ended.code == 2
     assert len(shown(ended.text.strip())) == 1
-
-
-def test_view_of_a_missing_scene(runner, place, trained):
-    """`view` is the only subcommand that writes nothing: a missing scene is a one-line error."""
-    shutil.copytree(trained, place / "trained")
-    shutil.rmtree(place / "trained" / "point_cloud")
-    refused(runner.run(["view", place / "trained", "--no-browser"]), "contains no scene")

@@ -9,7 +9,6 @@ import torch
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.train import train
 from snowsplat.pipeline.watch import NewestScene
-from snowsplat.project.project import Project
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
@@ -67,9 +66,3 @@ def test_a_checkpoint_of_something_else(trained, tmp_path):
         checkpoint.save(out.checkpoints, 5000, tensors, {})
         with pytest.raises(UserError, match="not a checkpoint of a training run"):
             NewestScene(out, None)()
-
-
-def test_the_folder_of_make_contains_the_output_folder_of_training(trained, tmp_path):
-    shutil.copytree(trained, tmp_path / "made" / "scene")
-    assert Project.open(tmp_path / "made").training_folder().path == tmp_path / "made" / "scene"
-    assert Project.open(trained).training_folder().path == trained

@@ -3,9 +3,6 @@
 import contextlib
 import os
 import resource
-import signal
-import time
-import warnings
 from unittest import mock
 
 import pytest
@@ -13,8 +10,6 @@ import torch
 
 from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
-
-from ..fork_server import popen
 
 
 def some_tensors() -> dict[str, torch.Tensor]:
@@ -165,48 +160,3 @@ def test_a_failed_save_leaves_older_checkpoints(tmp_path, monkeypatch):
         "step_000001.safetensors",
         "step_000002.safetensors",
     ]
-
-
-SAVER = """
-import sys, torch
-from snowsplat.training.core import checkpoint
-table = torch.arange(4_000_000, dtype=torch.float32)
-print("ready", flush=True)
-step = 0
-while True:
-    step += 1
-    checkpoint.save(sys.argv[1], step, {"table": table + step}, {"step": step})
-"""
-
-
-@pytest.mark.slow
-def test_kill_9_during_a_save(tmp_path):
-    """The process is killed at different moments of a save of 16 MB. All final files are whole."""
-    cut = 0
-    for attempt in range(2):
-        folder = tmp_path / str(attempt)
-        process = popen("-c", SAVER, folder)
-        assert process.stdout is not None
-        process.stdout.readline()
-        deadline = time.monotonic() + 20
-        while not checkpoint.exists(folder):  # the first one is complete
-            assert time.monotonic() < deadline
-            time.sleep(0.001)
-        time.sleep(0.05)
-        while time.monotonic() < deadline:  # and another is being written
-            if any(folder.glob(".*tmp*")):
-                time.sleep(0.004 * attempt)
-                break
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        process.stdout.close()
-        cut += any(folder.glob(".*tmp*"))
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # the newest must be valid
-            newest = checkpoint.latest(folder)
-        assert newest is not None
-        assert newest.step == newest.meta["step"] > 0
-        assert newest.tensors["table"][1] == 1 + newest.step
-        checkpoint.save(folder, newest.step + 1, {"a": torch.zeros(1)}, {})
-        assert not list(folder.glob(".*"))  # the next save removes them
-    assert cut, "no kill happened during a save"

@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from snowsplat import ops
 from snowsplat.data.dataset import Dataset, View
 from snowsplat.data.load import load_dataset
 from snowsplat.scene.camera import Camera
@@ -252,20 +251,6 @@ def test_resuming_is_bit_identical(
     for name, tensor in second.state_tensors().items():
         assert torch.equal(tensor, expected[name]), name
     assert second.cameras.test_views()[0].camera.fx == whole.cameras.test_views()[0].camera.fx
-
-
-@pytest.mark.isa
-def test_the_number_of_threads_does_not_change_a_bit(dataset: Dataset) -> None:
-    threads, states = ops.get_num_threads(), []
-    try:
-        for count in (1, 2):
-            ops.set_num_threads(count)
-            trainer = Trainer(dataset, recipe("default", **SHORT, refine_poses=True))
-            trainer.run()
-            states.append(trainer.state_tensors())
-    finally:
-        ops.set_num_threads(threads)
-    assert all(torch.equal(states[1][name], tensor) for name, tensor in states[0].items())
 
 
 def test_a_checkpoint_without_refined_poses_is_rejected(dataset: Dataset) -> None:
