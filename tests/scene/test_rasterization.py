@@ -596,7 +596,7 @@ def test_a_size_that_is_no_integer_breaks_no_later_call() -> None:
     assert torch.equal(given.rendered()[0], before)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # loads the compiler of PyTorch
 def test_torch_compile_breaks_its_graph() -> None:
     given = inputs()
     call = torch.compile(lambda: given.rendered()[0], backend="eager")

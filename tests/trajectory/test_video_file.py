@@ -86,7 +86,7 @@ with video_writer(Path(sys.argv[1]), 304, 208, 30) as add:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # two new processes
 def test_the_bytes_depend_neither_on_the_content_of_unused_memory_nor_on_processors(tmp_path):
     """glibc fills memory with the complement of MALLOC_PERTURB_ before a program gets it."""
     videos = []
