@@ -69,6 +69,17 @@ def test_what_is_left_of_an_edit_is_done(studio, finished, monkeypatch, before):
     assert not finished.begun.exists()
 
 
+def test_files_of_a_killed_edit_are_removed(finished):
+    made = finished.scene_file().parent
+    names = [".box_edited.ply.tmp", "..box_edited.ply.tmp.tmp", ".box_edited.next.json.tmp"]
+    files = [finished.kept / ".edit_begun.json.tmp", *(made / name for name in names)]
+    others = made / ".other_edited.ply.tmp"
+    for file in (*files, others):
+        file.touch()
+    changes.show_scene(finished)
+    assert [file.exists() for file in (*files, others)] == [False] * 4 + [True]
+
+
 def test_a_failed_edit_leaves_nothing(studio, finished):
     """Neither its title nor the film of that time appear when the scene is made again."""
     write_json(finished.plan, asdict(PageFilm(KEYS)))

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from snowsplat.util.errors import Problem
-from snowsplat.util.files import atomic_path, write_json
+from snowsplat.util.files import atomic_path, remove_temporaries, write_json
 from snowsplat.util.safe_json import from_json, read_json
 
 _ENDING = "_edited"
@@ -210,8 +210,18 @@ def written_with_record(edited: Path, record: EditRecord) -> Iterator[Path]:
 
 def remove_edited(edited: Path) -> None:
     """Remove an edited scene, and then its record. Raises OSError: the folder is not writable."""
-    for file in (edited, record_file(edited), _announced_file(edited)):
+    for file in _files_of(edited):
         file.unlink(missing_ok=True)
+
+
+def remove_unfinished(scene: Path) -> None:
+    """Remove the temporary files of an edit of this scene whose process was killed."""
+    names = [file.name for file in _files_of(edited_file(scene))]
+    remove_temporaries(scene.parent, [*names, f".{names[0]}.tmp"])
+
+
+def _files_of(edited: Path) -> tuple[Path, Path, Path]:
+    return edited, record_file(edited), _announced_file(edited)
 
 
 def _announced_file(edited: Path) -> Path:

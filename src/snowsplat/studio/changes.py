@@ -27,7 +27,7 @@ from snowsplat.pipeline.mesh import write_mesh
 from snowsplat.pipeline.options.scene import PublishOptions
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.publish import PublishResult, publish
-from snowsplat.project.edit_record import PageEdit, edited_file
+from snowsplat.project.edit_record import PageEdit, edited_file, remove_unfinished
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project
 from snowsplat.project.site_folder import SiteFolder
@@ -36,7 +36,7 @@ from snowsplat.studio.hand_on import SURFACES, export_file, is_exported
 from snowsplat.studio.job import is_being_made
 from snowsplat.studio.library import safe_title
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import new_entries, write_json
+from snowsplat.util.files import new_entries, remove_temporaries, write_json
 from snowsplat.util.safe_json import from_json, is_file, read_json
 from snowsplat.util.settings import Settings
 
@@ -160,6 +160,8 @@ def _edit(scene: StudioScene, version: str, changes: PageEdit | None) -> dict[st
 def finish_edit(scene: StudioScene) -> None:
     """Do what is left of an edit whose process was killed, if the scene was edited: the title is
     changed, and the keys of the film keep their places. Doing it again changes nothing."""
+    remove_temporaries(scene.kept, [scene.begun.name])
+    remove_unfinished(finished(scene))
     try:
         begun = from_json(_Begun, read_json(scene.begun))
     except (OSError, ValueError):  # nothing is left
