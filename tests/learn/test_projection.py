@@ -1,5 +1,6 @@
 """The formulas of docs/learn/projection.md."""
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -72,3 +73,12 @@ def test_the_covariance_in_the_image_is_that_of_the_code():
         assert torch.allclose(splats.conics[i], inverse, rtol=1e-9)
         assert torch.allclose(splats.means2d[i], pi(p))
     assert not torch.allclose(jacobian(beyond), jacobian(beyond, clamped=True))
+
+
+def test_two_points_instead_of_the_jacobian():
+    """The example of docs/learn/since-2023.md: y = 1/z at z = 1 ± s, and a series of the mean."""
+    s = 0.3
+    y = [1 / (1 - s), 1 / (1 + s)]
+    assert (y[0] + y[1]) / 2 == pytest.approx(1 / (1 - s**2)) == pytest.approx(1.099, abs=5e-4)
+    assert (y[0] - y[1]) / 2 == pytest.approx(s / (1 - s**2)) == pytest.approx(0.330, abs=5e-4)
+    assert 1 + s**2 + 3 * s**4 == pytest.approx(1.114, abs=5e-4)
