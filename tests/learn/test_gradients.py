@@ -131,6 +131,15 @@ def test_splats_to_parameters():
         w_only = 2 * (q_hat[1] * (dR[2, 1] - dR[1, 2]) + q_hat[2] * (dR[0, 2] - dR[2, 0])
                       + q_hat[3] * (dR[1, 0] - dR[0, 1]))  # fmt: skip
         assert dq[0] == pytest.approx(float(w_only))
+        w_hat, xyz = q_hat[0], q_hat[1:]
+        for k in range(3):  # x̄ of the page, and ȳ and z̄ by the cyclic replacement
+            i1, i2, i3 = k, (k + 1) % 3, (k + 2) % 3
+            by_page = 2 * (
+                xyz[i2] * (dR[i1, i2] + dR[i2, i1])
+                + xyz[i3] * (dR[i3, i1] + dR[i1, i3])
+                + w_hat * (dR[i3, i2] - dR[i2, i3])
+            ) - 4 * xyz[i1] * (dR[i2, i2] + dR[i3, i3])
+            assert dq[1 + k] == pytest.approx(float(by_page))
         expected = (dq - (dq @ q_hat) * q_hat) / one["quats"].norm()
         assert torch.allclose(values["quats"].grad[i], expected)
 
@@ -185,3 +194,87 @@ def test_finite_differences():
         errors[h] = abs(estimate / float(grad[1, 0]) - 1)
     assert errors[1e-5] < 1e-8
     assert errors[1e-10] > 10 * errors[1e-5]
+
+
+def test_the_gradient_of_ssim_is_three_blurs():
+    """Step 1, with the blur as a matrix: the window is symmetric."""
+    C, P = (normal(9, 8, 1, seed=seed).sigmoid() for seed in (1, 2))
+    C.requires_grad_()
+    (expected,) = torch.autograd.grad(reference.ssim(C, P) * C.numel(), C)
+
+    def window(n: int) -> Tensor:
+        d = torch.arange(n)[:, None] - torch.arange(n)
+        whole = torch.exp(-((torch.arange(11).double() - 5) ** 2) / 4.5).sum()
+        return torch.exp(-(d.double() ** 2) / 4.5) * (d.abs() <= 5) / whole
+
+    def blur(X: Tensor) -> Tensor:
+        return window(9) @ X @ window(8)
+
+    C, P = C.detach()[:, :, 0], P[:, :, 0]
+    mu_C, mu_P, k1, k2 = blur(C), blur(P), 0.01**2, 0.03**2
+    A1, A2 = 2 * mu_C * mu_P + k1, 2 * (blur(C * P) - mu_C * mu_P) + k2
+    B1, B2 = mu_C**2 + mu_P**2 + k1, blur(C * C) - mu_C**2 + blur(P * P) - mu_P**2 + k2
+    S = A1 * A2 / (B1 * B2)
+    a, b, c = S * (2 * mu_P / A1 - 2 * mu_C / B1), -S / B2, 2 * S / A2
+    gradient = blur(a - 2 * mu_C * b - mu_P * c) + 2 * C * blur(b) + P * blur(c)
+    assert torch.allclose(gradient, expected[:, :, 0])
+
+
+def test_the_filter_of_antialiased_scenes():
+    """Step 5: o' = o √(det UUᵀ / det Σ')."""
+    U, o, upstream = normal(2, 3, seed=1).requires_grad_(), torch.tensor(0.7).double(), 1.3
+    Sigma = U @ U.T + 0.3 * torch.eye(2)
+    changed = o * (torch.linalg.det(U @ U.T) / torch.linalg.det(Sigma)).sqrt()
+    (upstream * changed).backward()
+    with torch.no_grad():
+        bar = 0.5 * changed * upstream * ((U @ U.T).inverse() - Sigma.inverse())
+        assert torch.allclose(U.grad, 2 * bar @ U)
+
+
+def test_pose_and_focal_length():
+    """Step 9, from the gradients of p, T, J and u that the steps before it give."""
+    values = [p.detach() for p in parameters(4).values()]
+    omega, tau = (torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    zoom = torch.ones((), dtype=torch.float64, requires_grad=True)
+    x, y, z = omega
+    zero = torch.zeros_like(x)
+    turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    pose = POSE + turn @ POSE + torch.cat([torch.zeros(3, 3), tau[:, None]], dim=1)
+    splats, _ = reference._project_rows(values, pose, VIEW, zoom)
+    upstream = normal(*splats.packed.shape, seed=9)
+    upstream[:, DEPTHS] = 0
+    (splats.packed * upstream).sum().backward()
+
+    W, t = POSE[:, :3], POSE[:, 3]
+    by_tau, by_omega, by_focal = torch.zeros(3).double(), torch.zeros(3).double(), 0.0
+    for i in range(4):
+        mean, log_scales, quat, _, sh_dc, sh_rest = (value[i] for value in values)
+        row = upstream[i]
+        p = (W @ mean + t).requires_grad_()
+        J = torch.zeros(2, 3).double()
+        J[0, 0], J[0, 2] = FX / p[2], -FX * p[0] / p[2] ** 2
+        J[1, 1], J[1, 2] = FY / p[2], -FY * p[1] / p[2] ** 2
+        J.retain_grad()
+        T = J @ W
+        U = T @ (reference._rotation_matrices(quat[None])[0] * log_scales.exp())
+        K = (U @ U.T + reference.LOW_PASS * torch.eye(2)).inverse()
+        u = (mean + W.T @ t).requires_grad_()
+        basis = reference.sh_basis((u / u.norm())[None], 2)[0]
+        color = (0.5 + basis @ torch.cat([sh_dc, sh_rest])).clamp(min=0)
+        m = torch.stack([FX * p[0] / p[2], FY * p[1] / p[2]])
+        T.retain_grad()
+        conic = torch.stack([K[0, 0], K[0, 1], K[1, 1]])
+        loss = m @ row[MEANS2D] + conic @ row[CONICS] + color @ row[8:11]
+        loss.backward()
+        with torch.no_grad():
+            A = J.T @ T.grad @ W.T
+            axial = torch.stack([A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]])
+            by_tau += p.grad + W @ u.grad
+            by_omega += torch.linalg.cross(p, p.grad) + axial
+            x, y, z = p
+            for f, at, k in ((FX, x, 0), (FY, y, 1)):
+                of_f = at / z * row[MEANS2D][k] + J.grad[k, k] / z - at / z**2 * J.grad[k, 2]
+                by_focal += f * of_f  # both focal lengths are multiplied by the zoom
+    assert torch.allclose(tau.grad, by_tau)
+    assert torch.allclose(omega.grad, by_omega)
+    assert zoom.grad == pytest.approx(float(by_focal))
