@@ -3,7 +3,7 @@
     python benchmarks/blocks.py --out OUT
     python benchmarks/blocks.py --out OUT --photos 96 --blocks 3 --gaussians 40000
 
-The photos are ray traced (`tests.scenes.street`). Every 8th is held out. Each training is a
+The photos are ray traced (`benchmarks/street.py`). Every 8th is held out. Each training is a
 process of its own, whose memory is measured. Results are kept in OUT; the same command continues.
 """
 
@@ -41,7 +41,7 @@ from snowsplat.util.machine import peak_bytes, reset_peak, resident_bytes
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tests.scenes.street_dataset import write_street_dataset
+from street_dataset import write_street_dataset
 
 WORST = 6
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from street import street
+from street_dataset import DATASET_FROM_SCENE, walk_along
 from tests.scenes.depth import depth_map
-from tests.scenes.street import street
-from tests.scenes.street_dataset import DATASET_FROM_SCENE, walk_along
 
 from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of

@@ -32,8 +32,8 @@ from snowsplat.synthetic.still_life import still_life
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from passer_by import chosen_photos, passers_by, shooting
 from tests.scenes.depth import depth_map
-from tests.scenes.passer_by import chosen_photos, passers_by, shooting
 
 COUNT = 48
 SIZE = (400, 300)

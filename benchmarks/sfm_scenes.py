@@ -53,8 +53,8 @@ from snowsplat.trajectory.video_file import video_writer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from street import street
 from tests.scenes.lenses import Equirectangular, fisheye_lens
-from tests.scenes.street import street
 
 #: Part of the folder names of the photos. Increase it with every change that affects the photos.
 VERSION = 5

@@ -3,7 +3,7 @@
     python benchmarks/sky.py --out OUT
     python benchmarks/sky.py --out OUT --seeds 0 1 2
 
-The photos are ray traced (`tests.scenes.street`); every 8th is held out. Each seed is
+The photos are ray traced (`benchmarks/street.py`); every 8th is held out. Each seed is
 trained with and without it. Fog is measured along the street, with cameras that no photo has: the
 opacity of the Gaussians that are clearly nearer than the surface that the ray tracer finds there.
 OUT also gets pictures (photo, without, with) and films. Results are kept; the same command resumes.
@@ -35,9 +35,9 @@ from snowsplat.synthetic.scene import Scene
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from street import street
+from street_dataset import DATASET_FROM_SCENE, write_street_dataset
 from tests.scenes.depth import distances
-from tests.scenes.street import street
-from tests.scenes.street_dataset import DATASET_FROM_SCENE, write_street_dataset
 
 #: A Gaussian is before a surface if its depth is less than this share of the surface's.
 BEFORE = 0.8

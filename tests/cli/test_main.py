@@ -55,7 +55,8 @@ def test_alone_on_a_screen_it_opens_the_studio(run, monkeypatch):
     assert "snowsplat studio" in run("--help").out
 
 
-def test_each_subcommand_has_help(run):
+def test_each_subcommand_has_help_of_the_width_of_the_terminal(run, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     assert run("help", "info") == run("info", "--help")
     for name in module.SUBCOMMANDS:
         own = run(name, "--help")
@@ -63,12 +64,7 @@ def test_each_subcommand_has_help(run):
         assert f"  snowsplat {name} " in own.out  # an example, on its own line
         assert "Examples:" in own.out
         assert "None" not in own.out  # tyro's text for a missing default
-
-
-def test_help_texts_are_wrapped_to_the_width_of_the_terminal(run, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    for name in module.SUBCOMMANDS:
-        lines = run(name, "--help").out.splitlines()[1:]  # without the usage, which tyro wraps
+        lines = own.out.splitlines()[1:]  # without the usage, which tyro wraps
         assert max(map(len, lines)) <= 80, name
     own = run("train", "--help").out
     paragraph = own[own.index("--recipe") : own.index("--minutes")]

@@ -98,19 +98,19 @@ def test_native_agrees_with_the_reference(native: Variant, cloud: str, k: int) -
     )
 
 
-@pytest.mark.parametrize("k", [2, 4, 8, 9, 64])
-def test_native_agrees_with_the_reference_for_any_number(native: Variant, k: int) -> None:
-    points = normal(generator(1), 200, 3)
+@pytest.mark.parametrize(
+    ("count", "k"),
+    [
+        *((count, 3) for count in (31, 32, 33, 127, 129, 1023, 1024, 1025)),
+        *((200, k) for k in (2, 4, 8, 9, 64)),
+    ],
+)
+def test_native_agrees_with_the_reference_for_any_number(
+    native: Variant, count: int, k: int
+) -> None:
+    points = uniform(generator(count), -1, 1, count, 3)
     expected = reference.neighbours(points, k)
     actual = native.ops.neighbours(points.to(native.dtype), k)
-    torch.testing.assert_close(actual.double(), expected, rtol=native.forward * 1e-1, atol=1e-12)
-
-
-@pytest.mark.parametrize("count", [31, 32, 33, 127, 129, 1023, 1024, 1025])
-def test_native_agrees_with_the_reference_for_any_count(native: Variant, count: int) -> None:
-    points = uniform(generator(count), -1, 1, count, 3)
-    expected = reference.neighbours(points)
-    actual = native.ops.neighbours(points.to(native.dtype))
     torch.testing.assert_close(actual.double(), expected, rtol=native.forward * 1e-1, atol=1e-12)
 
 

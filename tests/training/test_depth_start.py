@@ -54,13 +54,14 @@ def test_without_points_maps_may_have_a_unit(tmp_path: Path) -> None:
     assert float(error.max()) < 0.03
 
 
-def test_depths_of_no_confidence_are_not_used(tmp_path: Path) -> None:
-    data = dataset(tmp_path)
-    confidence = np.full((SIZE, SIZE), 255, np.uint8)
-    confidence[: SIZE // 2] = 0
-    Image.fromarray(confidence).save(tmp_path / "confidence.png")
-    file = tmp_path / "confidence.png"
-    points = found(replace(data, train=[replace(v, depth_confidence=file) for v in data.train]))
+@pytest.mark.parametrize("of", ["mask", "depth_confidence"])
+def test_masked_pixels_and_depths_of_no_confidence_are_not_used(tmp_path: Path, of: str) -> None:
+    data, file = dataset(tmp_path), tmp_path / "lower_half.png"
+    white = np.full((SIZE, SIZE), 255, np.uint8)
+    white[: SIZE // 2] = 0
+    Image.fromarray(white).save(file)
+    kept = {of: ImageSource(file, SIZE, SIZE) if of == "mask" else file}
+    points = found(replace(data, train=[replace(view, **kept) for view in data.train]))
     camera = cameras()[2]
     all_rows, rows = (camera.project(p.xyz)[0][:, 1] for p in (found(data), points))
     assert int((all_rows < SIZE / 2 - 8).sum()) > 50
@@ -76,21 +77,6 @@ def test_the_first_gaussians_are_at_the_points(tmp_path: Path) -> None:
         torch.device("cpu"),
     )
     assert float((gaussians.means.norm(dim=1) - 1.0).abs().max()) < 0.05
-
-
-def test_masked_pixels_are_not_used(tmp_path: Path) -> None:
-    data = dataset(tmp_path)
-    mask = np.full((SIZE, SIZE), 255, np.uint8)
-    mask[: SIZE // 2] = 0
-    Image.fromarray(mask).save(tmp_path / "mask.png")
-    source = ImageSource(tmp_path / "mask.png", SIZE, SIZE)
-    masked = replace(data, train=[replace(view, mask=source) for view in data.train])
-    points = found(masked)
-    camera = cameras()[2]
-    all_rows, rows = (camera.project(p.xyz)[0][:, 1] for p in (found(data), points))
-    assert int((all_rows < SIZE / 2 - 8).sum()) > 50
-    assert int((rows < SIZE / 2 - 8).sum()) == 0
-    assert len(points) > 100
 
 
 def test_a_map_that_contradicts_the_points_is_not_used(tmp_path: Path, caplog) -> None:

@@ -341,11 +341,6 @@ def test_starts_and_recipes_of_a_user(monkeypatch):
         register_start("a+b", STARTS["laser"])
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_every_sh_degree_is_accepted(degree):
-    assert recipe("paper", sh_degree=degree).sh_degree_at(30_000) == degree
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [

@@ -67,31 +67,22 @@ class Steps:
         return [bool(gradient.valid) for gradient in self.gradients]
 
 
-def test_a_step_within_its_capacity_runs_once() -> None:
-    steps = Steps(100, 90)
+@pytest.mark.parametrize(
+    ("required", "valid", "then"),
+    [
+        (90, [True], 100),
+        (91, [True], int(1.3 * 91)),  # it grows before it is exceeded
+        (100, [True], int(1.3 * 100)),
+        (101, [False, True], int(1.3 * 101)),
+    ],
+)
+def test_a_step_that_exceeds_its_capacity_is_repeated(
+    required: int, valid: list[bool], then: int
+) -> None:
+    steps = Steps(100, *[required] * len(valid))
     assert steps.run() == 0.5
-    assert steps.valid == [True]
-    assert steps.runner.capacity.instances == 100
-
-
-def test_the_capacity_grows_before_it_is_exceeded() -> None:
-    steps = Steps(100, 91)
-    steps.run()
-    assert steps.valid == [True]
-    assert steps.runner.capacity.instances == int(1.3 * 91)
-
-
-def test_a_step_that_exceeds_its_capacity_is_repeated_and_only_the_repetition_is_valid() -> None:
-    steps = Steps(100, 101, 101)
-    steps.run()
-    assert steps.valid == [False, True]
-    assert steps.runner.capacity.instances == int(1.3 * 101)
-
-
-def test_exactly_the_capacity_suffices() -> None:
-    steps = Steps(100, 100)
-    steps.run()
-    assert steps.valid == [True]
+    assert steps.valid == valid
+    assert steps.runner.capacity.instances == then
 
 
 def test_the_initial_capacity() -> None:

@@ -113,29 +113,22 @@ def test_a_hard_part_of_the_scene_does_not_stand_out():
     assert standing_out(psnr + 6 * hard, explained - 0.25 + 0.25 * hard, *ring()) == ()
 
 
-def test_a_view_that_is_explained_a_little_less_does_not_stand_out():
-    psnr, explained = usual()
-    psnr[WRONG], explained[WRONG] = 12.0, 0.65
-    assert standing_out(psnr, explained, *ring()) == ()
-    explained[WRONG] = 0.55
-    assert standing_out(psnr, explained, *ring()) == (WRONG,)
-
-
-def test_a_flat_photo_does_not_stand_out():
-    """Its variance is mostly noise, which no scene explains."""
-    psnr, explained = usual()
-    psnr[WRONG], explained[WRONG] = 32.0, 0.1
-    assert standing_out(psnr, explained, *ring()) == ()
-
-
-def test_a_photo_of_low_contrast_does_not_stand_out():
-    """A photo of a plain wall at the end of a corridor, whose few details are not there yet."""
-    psnr, explained = usual()
-    explained[WRONG] = 0.2
-    psnr[WRONG] = 20.5
-    assert standing_out(psnr, explained, *ring()) == ()
-    psnr[WRONG] = 19.5
-    assert standing_out(psnr, explained, *ring()) == (WRONG,)
+@pytest.mark.parametrize(
+    ("psnr", "explained", "stands_out"),
+    [
+        (12.0, 0.65, False),  # a little less than the others
+        (12.0, 0.55, True),
+        # Flat: its variance is mostly noise, which no scene explains.
+        (32.0, 0.1, False),
+        # A plain wall at the end of a corridor, whose few details are not there yet.
+        (20.5, 0.2, False),
+        (19.5, 0.2, True),
+    ],
+)
+def test_how_wrong_a_view_must_be(psnr, explained, stands_out):
+    psnrs, shares = usual()
+    psnrs[WRONG], shares[WRONG] = psnr, explained
+    assert standing_out(psnrs, shares, *ring()) == ((WRONG,) if stands_out else ())
 
 
 def test_no_view_stands_out_if_there_are_few_or_if_many_would():

@@ -306,15 +306,6 @@ def test_damaged_images_raise_when_requested(views):
         assert torch.equal(loader.get(views[5]).rgb, stored(views[5]))
 
 
-@pytest.mark.filterwarnings("ignore:::PIL")
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tif"])
-def test_damaged_files_raise_user_errors(tmp_path, count_rejected, suffix):
-    random = np.random.default_rng(0)
-    pixels = random.integers(0, 256, (16, 20, 3)).astype(np.uint8)
-    view = make_view(tmp_path / f"a{suffix}", pixels)
-    assert count_rejected(view.image.path, lambda: load_image(view.image)) > 0
-
-
 def test_a_deleted_image(views):
     views[0].image.path.unlink()
     with ImageLoader(views) as loader, pytest.raises(UserError, match="no such image"):

@@ -262,12 +262,17 @@ def test_children_depend_on_the_generator_of_the_control_alone():
     assert torch.equal(*scenes)
 
 
-@pytest.mark.parametrize("step", [500, 15_000])
-def test_the_first_and_last_step_densify(step):
+@pytest.mark.parametrize(
+    ("step", "densifies"),
+    [(400, False), (500, True), (650, False), (15_000, True), (15_100, False)],
+)
+def test_the_steps_that_densify(step, densifies):
     gaussians = gaussians_of([0.05])
     control, adam = set_up(gaussians)
     seen(control, [1.0])
-    assert len(control.after_step(step, gaussians, adam)) == 2
+    refined = control.after_step(step, gaussians, adam)
+    assert len(refined) == 1 + densifies
+    assert bool(control.views.any()) == (not densifies)
 
 
 def test_thresholds_are_exclusive():
@@ -297,15 +302,6 @@ def test_nonfinite_parameters_stop_a_refinement():
     control.after_step(650, gaussians, adam)  # not a step with densification
     with pytest.raises(Diverged, match=r"^step 600: non-finite Gaussians, means \(1 row\)"):
         control.after_step(600, gaussians, adam)
-
-
-@pytest.mark.parametrize("step", [400, 650, 15_100])
-def test_nothing_happens_outside_of_the_schedule(step):
-    gaussians = gaussians_of([0.05])
-    control, adam = set_up(gaussians)
-    seen(control, [1.0])
-    assert control.after_step(step, gaussians, adam) is gaussians
-    assert control.views.any()
 
 
 def test_transparent_gaussians_are_removed():

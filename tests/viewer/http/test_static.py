@@ -112,19 +112,15 @@ def test_a_file_in_memory_is_sent_as_a_whole(server):
     assert (response.status, body) == (200, SCENE)
 
 
-def test_files_on_disk(tmp_path):
+def test_a_file_on_disk_in_a_folder_that_is_written_again(tmp_path):
     path = tmp_path / "levels.webp"
     path.write_bytes(SCENE)
     with serve({"0_0/levels.webp": FileOnDisk(path, "image/webp")}, POLICY) as server:
         response, body = ask(server, "0_0/levels.webp")
-        assert (response.status, response.getheader("Content-Type")) == (200, "image/webp")
-        assert body == SCENE
-        response, body = ask(server, "0_0/levels.webp", Range="bytes=700000-700009")
-        assert (response.status, body) == (206, SCENE[700_000:700_010])
-        etag = response.getheader("ETag")
-        assert ask(server, "0_0/levels.webp", If_None_Match=etag)[0].status == 304
+        assert (body, response.getheader("Content-Type")) == (SCENE, "image/webp")
         assert ask(server, "0_0/../0_0/levels.webp")[0].status == 404
-        path.write_bytes(SCENE[:1000])  # it was written again
+        path.write_bytes(SCENE[:1000])
+        etag = response.getheader("ETag")
         response, body = ask(server, "0_0/levels.webp", If_None_Match=etag)
         assert (response.status, body) == (200, SCENE[:1000])
 

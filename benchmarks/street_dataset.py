@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from street import HALF_WIDTH, street
+from tests.scenes.depth import distances
 from torch import Tensor
 
 from snowsplat.data.colmap.model import write_posed
@@ -16,9 +18,6 @@ from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic.photographer import Lens, roll, take_photos
 from snowsplat.synthetic.scene import Scene
-
-from .depth import distances
-from .street import HALF_WIDTH, street
 
 #: Metres of the street per photo.
 _PITCH = 0.16

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
+from tests.scenes.depth import distances
 from torch import Tensor
 
 from snowsplat.scene.geometry import invert_rigid
@@ -14,8 +15,6 @@ from snowsplat.synthetic.photographer import RAYS, CentredLens, develop, tiles
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import FLOOR, LAMP
-
-from .depth import distances
 
 _DISTANCE = 1.25  # metres, from the centre of the table
 _SPREAD = 0.7  # radians, standard deviation of the direction from the centre
