@@ -7,10 +7,13 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
+from snowsplat.data.photos.suffixes import PHOTO_SUFFIXES
 from snowsplat.studio import uploads
-from snowsplat.studio.given_photos import first_given, given_photos, leave_out
+from snowsplat.studio.given_photos import find_given, first_given, given_photos, leave_out
 from snowsplat.studio.library import UnknownScene
+from snowsplat.studio.picture_requests import small_jpeg
 from snowsplat.studio.uploads import NoSpace, Upload, WrongPart, safe_path, write_part
 from snowsplat.util.errors import UserError
 
@@ -57,6 +60,25 @@ def test_a_photo_that_is_left_out(scene):
             leave_out(scene, name, out)
     leave_out(scene, "tour/a.jpg", False)
     assert received(scene) == {"tour/a.jpg": 3, "tour/b.jpg": 3}
+
+
+def test_every_photo_that_sfm_uses_can_be_left_out(scene):
+    """The small picture of each of them is found, too, without a list of the folder."""
+    names = [f"a{number}{suffix}" for number, suffix in enumerate(sorted(PHOTO_SUFFIXES))]
+    for name in names:
+        send(scene, name, 1, 0, b"0")
+    assert [photo.name for photo in given_photos(scene)] == names
+    for name in names:
+        leave_out(scene, name, True)
+        assert find_given(scene, name).out
+    assert received(scene) == {}
+
+
+def test_the_small_picture_of_a_photo_of_a_phone(scene):
+    pillow_heif = pytest.importorskip("pillow_heif")
+    scene.photos.mkdir(exist_ok=True)
+    pillow_heif.from_pillow(Image.new("RGB", (64, 48))).save(scene.photos / "a.heic")
+    assert small_jpeg(find_given(scene, "a.heic").path).startswith(b"\xff\xd8")
 
 
 def test_photos_in_a_folder_of_the_user_stay(library, tmp_path):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from snowsplat.data.photos.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from snowsplat.data.points_ply import read_points
 from snowsplat.formats import Format, GaussianArrays, ply
 from snowsplat.formats.lod import LEVELS, read_index
@@ -185,8 +186,6 @@ def _photos(path: Path, otherwise: UserError) -> dict[str, Any]:
 
 def _has_photos(path: Path) -> bool:
     """Whether a zip file has photos or videos, and is not a SOG scene."""
-    from snowsplat.sfm.ingest.search.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES  # torch
-
     names = files_in(path)
     if any(name.endswith(_ROOT_OF_SOG) for name in names):
         return False

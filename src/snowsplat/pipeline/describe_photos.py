@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from snowsplat.data.maps.mask_pixels import doubt_about_files
+from snowsplat.data.photos.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from snowsplat.data.readers.projects import advice
 from snowsplat.pipeline.options.make import PRESETS
 from snowsplat.project.left_out import LeftOut
@@ -15,7 +16,7 @@ from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import measure_speed, predicted_seconds, survey
 from snowsplat.sfm.ingest.photos.photo_files import Header, Unusable, read_header
 from snowsplat.sfm.ingest.search.archive import files_in
-from snowsplat.sfm.ingest.search.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, Sources
+from snowsplat.sfm.ingest.search.sources import Source, Sources
 from snowsplat.sfm.ingest.video.clip import max_frame_count, read_clip
 from snowsplat.util.duration import duration
 from snowsplat.util.files import shown

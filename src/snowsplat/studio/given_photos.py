@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from snowsplat.data.photos.suffixes import PHOTO_SUFFIXES
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio.library import UnknownScene
 from snowsplat.util.errors import UserError
 from snowsplat.util.natural_order import natural_key
+from snowsplat.util.safe_json import inside, is_file
 
-#: Of the photos that are shown.
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".tif", ".tiff")
 _MOST = 2000  # photos that are listed
 
 
@@ -33,13 +33,26 @@ class GivenPhoto:
 
 def given_photos(scene: StudioScene) -> list[GivenPhoto]:
     """The photos in natural order of their names; empty if nothing was given."""
-    found = [*_used(scene), *_photos_in(scene.left_out, True)]
+    found = [photo for root, out in _roots(scene) for photo in _photos_in(root, out)]
     return sorted(found, key=lambda photo: natural_key(photo.name))[:_MOST]
+
+
+def find_given(scene: StudioScene, name: str) -> GivenPhoto:
+    """The photo of a name, which is used or left out; no folder is listed.
+
+    Raises: UnknownScene: there is none.
+    """
+    for root, out in _roots(scene):
+        path = root if root.name == name and root.is_file() else inside(root, name)
+        if path and path.suffix.lower() in PHOTO_SUFFIXES and is_file(path):
+            return GivenPhoto(name, path, out)
+    raise UnknownScene("there is no such photo")
 
 
 def first_given(scene: StudioScene) -> Path | None:
     """A photo that is used. It is found soon, however many photos the folder of a user has."""
-    return next((photo.path for photo in _used(scene)), None)
+    used = (photo for root, out in _roots(scene) if not out for photo in _photos_in(root, out))
+    return next((photo.path for photo in used), None)
 
 
 def leave_out(scene: StudioScene, name: str, out: bool) -> None:
@@ -53,18 +66,20 @@ def leave_out(scene: StudioScene, name: str, out: bool) -> None:
         raise UserError(
             "the photos are in {inputs}; remove the photo there", inputs=scene.job.inputs[0]
         )
-    found = next((p for p in given_photos(scene) if p.name == name and p.out != out), None)
+    found = find_given(scene, name)
     target = (scene.left_out if out else scene.photos) / name
-    if found is None or target.exists():
+    if found.out == out or target.exists():
         raise UnknownScene("there is no such photo")
     target.parent.mkdir(parents=True, exist_ok=True)
     os.replace(found.path, target)
 
 
-def _used(scene: StudioScene) -> Iterator[GivenPhoto]:
+def _roots(scene: StudioScene) -> Iterator[tuple[Path, bool]]:
+    """The photos and folders that were given, and whether the user has left out what is there."""
     if not scene.found:
         for root in [Path(path) for path in scene.job.inputs] or [scene.photos]:
-            yield from _photos_in(root, False)
+            yield root, False
+    yield scene.left_out, True
 
 
 def _photos_in(root: Path, out: bool) -> Iterator[GivenPhoto]:

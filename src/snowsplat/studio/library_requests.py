@@ -14,6 +14,7 @@ from urllib.parse import urljoin
 import segno
 from starlette.requests import Request
 
+from snowsplat.data.photos.suffixes import VIDEO_SUFFIXES
 from snowsplat.studio import job
 from snowsplat.studio.picture_requests import SUFFIXES
 from snowsplat.studio.requests import File, Studio, json_object
@@ -26,7 +27,8 @@ from snowsplat.viewer.http.guard import LOOK
 _PAGES = Path(__file__).parent / "pages"
 _FOLDERS = 500  # that are listed
 # The endings of the files that are listed: videos, zip files, and finished scenes.
-_FILES = (".mp4", ".mov", ".zip", ".ply", ".spz", ".sog", ".splat", ".ksplat", ".glb", ".usdz")
+_SCENES = {".ply", ".spz", ".sog", ".splat", ".ksplat", ".glb", ".usdz"}
+_FILES = VIDEO_SUFFIXES | {".zip"} | _SCENES
 
 
 async def page(studio: Studio, request: Request) -> Any:

@@ -8,14 +8,15 @@ import math
 from pathlib import Path
 from typing import Any
 
-from PIL import Image, ImageOps
+from PIL import ImageOps
 from starlette.requests import Request
 from starlette.responses import Response
 
+from snowsplat.data.photos.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from snowsplat.project.project import Project
 from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
-from snowsplat.studio.given_photos import PHOTO_SUFFIXES, first_given, given_photos
+from snowsplat.studio.given_photos import find_given, first_given, given_photos
 from snowsplat.studio.library import UnknownScene
 from snowsplat.studio.requests import File, SceneRoutes, Studio
 from snowsplat.util.errors import UserError
@@ -24,7 +25,7 @@ from snowsplat.util.safe_json import is_file, printable
 _PHOTOS = 120  # of a job, of which small pictures are shown
 _SMALL = 320  # pixels of their longer side
 #: Of photos, videos and zip files.
-SUFFIXES = (*PHOTO_SUFFIXES, ".mp4", ".mov", ".zip")
+SUFFIXES = PHOTO_SUFFIXES | VIDEO_SUFFIXES | {".zip"}
 
 
 async def picture(studio: Studio, request: Request, scene: StudioScene) -> Any:
@@ -52,13 +53,9 @@ async def given(studio: Studio, request: Request, scene: StudioScene) -> Any:
 
 
 async def given_photo(studio: Studio, request: Request, scene: StudioScene) -> Any:
-    name = request.path_params["photo"]
-    photos = await asyncio.to_thread(given_photos, scene)
-    path = next((photo.path for photo in photos if photo.name == name), None)
-    if path is None:
-        raise UnknownScene("there is no such photo")
+    found = await asyncio.to_thread(find_given, scene, request.path_params["photo"])
     try:
-        return Response(await asyncio.to_thread(small_jpeg, path), media_type="image/jpeg")
+        return Response(await asyncio.to_thread(small_jpeg, found.path), media_type="image/jpeg")
     except UserError:  # a damaged photo is listed, without a picture
         return Response(status_code=204)
 
@@ -114,13 +111,15 @@ def picture_of(scene: StudioScene) -> Path | None:
 
 def small_jpeg(path: Path) -> bytes:
     """A small picture as a JPEG file. Raises UserError: the file is no photo."""
+    from snowsplat.sfm.ingest.photos.photo_files import open_image  # HEIC, too
+
     try:
-        with Image.open(path) as photo:
+        with open_image(path) as photo:
             photo.draft("RGB", (2 * _SMALL, 2 * _SMALL))  # faster JPEG decoding
             small = ImageOps.exif_transpose(photo)
             small.thumbnail((_SMALL, _SMALL))
             file = io.BytesIO()
             small.convert("RGB").save(file, "JPEG", quality=80)
             return file.getvalue()
-    except (OSError, ValueError, SyntaxError):
+    except Exception:  # anything that Pillow raises for a damaged file
         raise UserError("{name}: cannot be shown", name=printable(path.name)) from None

@@ -12,6 +12,7 @@ from typing import Literal
 from snowsplat.data.files.listing import files_below, folder_kind, original_of
 from snowsplat.data.files.masks import FoundMasks, find_masks
 from snowsplat.data.photos.image_file import OPTIONAL_FORMATS
+from snowsplat.data.photos.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from snowsplat.data.readers import photo_folder, poses_in
 from snowsplat.data.readers.projects import advice
 from snowsplat.project.left_out import LeftOut
@@ -27,18 +28,6 @@ from snowsplat.util.files import shown
 from snowsplat.util.messages import Message, message, plural
 from snowsplat.util.names import first_names
 
-
-def _suffixes(names: str) -> frozenset[str]:
-    return frozenset(f".{name}" for name in names.split())
-
-
-PHOTO_SUFFIXES = _suffixes(
-    "jpg jpeg jpe jfif mpo png webp tif tiff heic heif hif bmp ppm "
-    + " ".join(OPTIONAL_FORMATS).lower()
-)
-VIDEO_SUFFIXES = _suffixes(
-    "mp4 mov m4v mkv avi webm mpg mpeg mts m2ts ts 3gp 3g2 wmv ogv mjpeg flv insv gif"
-)
 # Formats that are not read, first raw photos: the user should learn that such photos are not used.
 _UNREAD = (
     "dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef srw x3f raw iiq 3fr fff gpr rwl "
