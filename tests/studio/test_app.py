@@ -47,6 +47,7 @@ def test_the_page_and_its_parts(studio):
     look = studio.server._guard.look("scenes/a/site")
     assert about["addresses"][0]["url"] == f"http://192.168.1.7:80/{look}/scenes/a/site/index.html"
     assert about["addresses"][0]["code"].startswith("data:image/svg+xml")
+    assert about["look"] == f"../{look}/scenes/a/site/index.html"
 
 
 def test_an_upload_and_what_became_of_it(studio):

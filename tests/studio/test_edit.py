@@ -139,21 +139,21 @@ def test_lasso_delete_undo_delete_save(studio, forked, finished):
         before = page.screenshot()
         press(page, "Edit")
         press(page, "Lasso")
-        page._mouse("mousePressed", 500, 100, button="left", clickCount=1)
-        for x, y in ((890, 100), (890, 590), (500, 590)):
+        page._mouse("mousePressed", 690, 100, button="left", clickCount=1)
+        for x, y in ((890, 100), (890, 590), (690, 590)):
             page._mouse("mouseMoved", x, y, button="left", buttons=1)
-        page._mouse("mouseReleased", 500, 590, button="left", clickCount=1)
+        page._mouse("mouseReleased", 690, 590, button="left", clickCount=1)
         page.wait_for("!document.querySelector('.snow-edit > p').textContent.startsWith('0 ')")
         selected = int(counts(page).split()[0])
         assert 20 < selected < N - 20
         press(page, "Delete")
-        assert counts(page) == f"0 selected, {selected} deleted"
+        assert counts(page) == f"0 Gaussians selected, {selected} deleted"
         for kind in ("rawKeyDown", "keyUp"):
             page.call("Input.dispatchKeyEvent", type=kind, key="z", code="KeyZ", modifiers=2)
-        assert counts(page) == f"{selected} selected, 0 deleted"
+        assert counts(page) == f"{selected} Gaussians selected, 0 deleted"
         for kind in ("rawKeyDown", "keyUp"):
             page.call("Input.dispatchKeyEvent", type=kind, key="Delete", code="Delete")
-        assert counts(page) == f"0 selected, {selected} deleted"
+        assert counts(page) == f"0 Gaussians selected, {selected} deleted"
         # A turn is seen, and undone exactly.
         pose = (
             "JSON.stringify([...sse.viewer.app.root.findByName('gsplat').getWorldTransform().data])"
@@ -172,7 +172,7 @@ def test_lasso_delete_undo_delete_save(studio, forked, finished):
         assert "Back to the original" in page.evaluate(
             "document.querySelector('.snow-edit').textContent"
         )
-        press(page, "Edit")  # its panel would cover the scene
+        press(page, "Edit")  # the scene has the whole window
         after = page.screenshot()
         assert not page.errors
     # What was in the lasso is gone; from the same place, the rest looks as before.

@@ -70,16 +70,27 @@ def test_a_film_is_stopped(studio, holder):
 def test_a_turn_is_level_and_keeps_its_distance():
     pages = Path(worker.__file__).parent / "pages"
     module = (pages / "film.js").as_uri()
-    script = f"""import {{ around, cameraAt }} from {json.dumps(module)};
-        const turn = around([3, 2, 4, 0, 1, 0, 40, 1.5], 4);
-        console.log(JSON.stringify([turn, cameraAt([[0, 0], [2, 4], [4, 0]], 0.75)]));"""
+    script = f"""import {{ around, cameraAt, turnOver }} from {json.dumps(module)};
+        const view = [3, 2, 4, 0, 1, 0, 40, 1.5];
+        const turn = around(view, turnOver(view, [], 4));
+        const side = [[4, 2, -3], [5, 2, 0], [3, 2, 4]];
+        const swing = around(view, turnOver(view, side, 4));
+        const ring = turnOver(view, [...side, [-3, 2, -4], [-4, 2, 3]], 4);
+        const between = cameraAt([[0, 0], [2, 4], [4, 0]], 0.75);
+        console.log(JSON.stringify([turn, between, swing, ring]));"""
     command = ["node", "--input-type=module", "-e", script]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    turn, between = json.loads(done.stdout)
+    turn, between, swing, ring = json.loads(done.stdout)
     assert between == [3, 2]
     expected = [[3, 4], [4, -3], [-3, -4], [-4, 3]]
     assert [[round(key[0], 9), round(key[2], 9)] for key in turn] == expected
     assert {(key[1], *key[3:]) for key in turn} == {(2, 0, 1, 0, 40, 1.5)}
+    # Photos of one side: there and back over it. Photos all round: all round.
+    half = 5 / math.sqrt(50)
+    places = [[3, 4], [7 * half, half], [4, -3], [7 * half, half]]
+    for key, place in zip(swing, places, strict=True):
+        assert [key[0], key[2]] == pytest.approx(place)
+    assert ring == pytest.approx([0, math.pi / 2, math.pi, 3 * math.pi / 2])
 
 
 @pytest.mark.browser

@@ -36,7 +36,7 @@ class InitialView:
 
     def camera(self, width: int, height: int) -> Camera:
         """The camera of a window of this size, in pixels, that shows the complete rectangle."""
-        across, down = self._tangents()
+        across, down = self.tangents()
         focal = 0.5 * min(width / across, height / down)
         position, target, up = (
             torch.tensor(point, dtype=torch.float64)
@@ -48,7 +48,7 @@ class InitialView:
 
     def with_aspect(self, aspect: float) -> InitialView:
         """The view of the smallest rectangle of this shape around the rectangle of this view."""
-        across, down = self._tangents()
+        across, down = self.tangents()
         longer = max(across, down * aspect) / min(aspect, 1.0)
         return replace(self, fov=_degrees(longer), aspect=aspect)
 
@@ -58,7 +58,7 @@ class InitialView:
         position, target = change.apply(points)
         return replace(self, position=_point(position), target=_point(target))
 
-    def _tangents(self) -> tuple[float, float]:
+    def tangents(self) -> tuple[float, float]:
         """Half of the width and of the height, at a distance of 1."""
         longer = math.tan(math.radians(self.fov / 2))
         return longer * min(self.aspect, 1.0), longer / max(self.aspect, 1.0)

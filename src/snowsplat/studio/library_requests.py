@@ -43,6 +43,7 @@ async def about(studio: Studio, request: Request) -> Any:
     codes = [segno.make(url, error="m").svg_data_uri(scale=4, border=2) for url in urls]
     return {
         "folder": str(studio.library.folder),
+        "look": f"../{look}/{path}",  # relative to the page
         "addresses": [{"url": u, "code": c} for u, c in zip(urls, codes, strict=True)],
     }
 

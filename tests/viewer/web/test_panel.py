@@ -18,7 +18,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.viewer.web.panel import Description, view_numbers
 from snowsplat.viewer.web.publication import write_html
 from snowsplat.viewer.web.scene import ReadyScene, ready
-from snowsplat.viewer.web.stops import stops_of
+from snowsplat.viewer.web.stops import first_stop, shown_at, stops_of
 
 from ...browser import Browser, Page
 
@@ -158,28 +158,32 @@ def test_windows_of_any_shape_show_the_complete_photo(file, scene):
 
 @pytest.mark.browser
 def test_a_window_shows_no_more_than_the_photos_do(scene, tmp_path):
-    """Also after a phone is turned. It begins with a photo that then shows a large subject best."""
+    """But always the core of the subject; also after a phone is turned. The page and the poster
+    begin with the first photo that has the core, here the fourth."""
+    path, views = tmp_path / "limited.html", scene.stops.views
+    across, down = scene.start.tangents()  # half of a photo
     seen = [(1.0, 1.5), (1.0, 1.0), (1.25, 1.0), (3.0, 1.0), *[(1.0, 1.0)] * 8]
-    path, aspect, views = tmp_path / "limited.html", scene.start.aspect, scene.stops.views
-    stops = scene.stops._replace(seen=seen, radius=3.0 * scene.stops.radius)
-    write_html(path, scene._replace(stops=stops))
+    held = [(9.0, 9.0)] * 3 + [(across / 2, down / 2)] * 9
+    stops = scene.stops._replace(seen=seen, held=held)
+    assert first_stop(stops) == 3
+    scene = scene._replace(stops=stops, start=stops.view(3), first=3)
+    write_html(path, scene)
     shown = f"(c => [c.aspectRatio, Math.tan(c.fov * Math.PI / 360)])({ENTITY}.camera)"
-
-    def half_height(view) -> float:
-        longer = math.tan(math.radians(view_numbers(view, aspect)[6] / 2))
-        return longer / max(aspect, 1.0)
-
     with opened(path, 600, 300) as page:  # 1.5 times as wide as the photos
-        wait_for_pose(page, pose_of(view_numbers(views[3], aspect)))
-        for i, times in ((2, 1.25 / 1.5), (3, 1.0)):
+        wait_for_pose(page, pose_of(view_numbers(views[3], scene.start.aspect)))
+        for i, times in ((2, 1.5), (4, 1.0), (3, 1.5)):
             page.evaluate(f"document.querySelector('.snow-stops').children[{i}].click()")
-            wait_for_pose(page, pose_of(view_numbers(views[i], aspect)))
-            expected = times * half_height(views[i])
-            page.wait_for(f"Math.abs({shown}[1] / {shown}[0] - {expected}) < 0.01", 30)
+            wait_for_pose(page, pose_of(view_numbers(views[i], scene.start.aspect)))
+            # The third one has a core that is larger than the photo, which is shown then.
+            page.wait_for(f"Math.abs({shown}[1] - {times * across}) < 0.01", 30)
+            camera = shown_at(stops, i, 600, 300)
+            assert 300 / camera.fx == pytest.approx(times * across)
         size = {"width": 300, "height": 600}
         page.call("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=False)
         page.wait_for(f"{shown}[0] < 0.6", 30)
-        page.wait_for(f"Math.abs({shown}[1] - {half_height(views[3])}) < 0.01", 30)
+        # The photos show its height only, but the core is as wide as half of it.
+        page.wait_for(f"Math.abs({shown}[1] - {across}) < 0.01", 30)
+        assert 300 / scene.camera(300, 600).fy == pytest.approx(across)
 
 
 def test_what_photos_show_beside_a_photo():

@@ -4,6 +4,7 @@
 import { button, make } from "./page.js";
 import { along, bounds, outside, project } from "./selection.js";
 import { say } from "./text.js";
+import { lengthOf } from "./units.js";
 
 const AXES = ["x", "y", "z"];
 const SIGNS = [-1, -1, 1]; // of the axes of the scene: the viewer has turned it by 180° about z
@@ -15,17 +16,35 @@ const ARROWS = new Map([
 ]);
 const STEP = 0.01; // of an arrow key, as a share of the first box; ten times as much with Shift
 const PAUSE = 1000; // milliseconds without a key, after which the next one begins another step
+const ROOM = 1.3; // times the radius of the subject, which the window shows with the box
 const BEYOND = 0.5; // of the first box, to both sides of it: the range of a slider
 
-/** The first box: its lower and its upper corner. */
-export function boxAround(/** @type {Float32Array} */ centers) {
+/**
+ * The first box, around the subject: its lower and its upper corner.
+ * @param {Float32Array} centers
+ * @param {number[]} subject its middle and its radius
+ */
+export function boxAround(centers, [x, y, z, radius]) {
     const corners = bounds(centers).map(corner => corner.map((value, k) => SIGNS[k] * value));
-    return [0, 1].map(side => AXES.map((_, k) => Math[side ? "max" : "min"](corners[0][k], corners[1][k])));
+    const all = [0, 1].map(side => AXES.map((_, k) => Math[side ? "max" : "min"](corners[0][k], corners[1][k])));
+    const around = [-radius, radius].map(by => [x + by, y + by, z + by]);
+    const [low, high] = AXES.map((_, k) => [
+        Math.max(all[0][k], around[0][k]),
+        Math.min(all[1][k], around[1][k]),
+    ]).reduce(
+        ([a, b], [from, to]) => [
+            [...a, from],
+            [...b, to],
+        ],
+        /** @type {number[][]} */ ([[], []]),
+    );
+    return low.every((value, k) => value < high[k]) ? [low, high] : all;
 }
 
 /** @param {import("./edit.js").Editing} editing */
-export function addBox({ edits, centers, canvas, overlay, model, select, show }) {
+export function addBox({ edits, scene, centers, canvas, overlay, model, select, show, frame }) {
     let sides = edits.present.box;
+    let framed = false; // whether it was shown
     const spans = AXES.map((_, k) => sides[1][k] - sides[0][k]);
     const inScene = (/** @type {number[]} */ point) => point.map((value, k) => SIGNS[k] * value);
     const middle = (/** @type {number} */ side, /** @type {number} */ axis) =>
@@ -71,6 +90,7 @@ export function addBox({ edits, centers, canvas, overlay, model, select, show })
         );
         slider.min = String(first - (side ? 1 : BEYOND) * spans[axis]);
         slider.max = String(first + (side ? BEYOND : 1) * spans[axis]);
+        const number = make("output");
         const handle = make(
             "div.snow-handle",
             { role: "slider", tabindex: 0, "aria-label": label, "data-axis": name },
@@ -115,16 +135,26 @@ export function addBox({ edits, centers, canvas, overlay, model, select, show })
             const value = sides[side][axis];
             slider.value = String(value);
             handle.ariaValueNow = String(value);
-            handle.ariaValueText = value.toPrecision(3);
+            handle.ariaValueText = number.textContent = lengthOf({ edits, scene }, value);
         }
         show();
-        return { axis, side, handle, slider, show };
+        return { axis, side, handle, slider, number, show };
     }
+
+    const seen = (/** @type {number} */ side, /** @type {number} */ axis) =>
+        project(model(), middle(side, axis), canvas.clientWidth, canvas.clientHeight);
+
+    /** Whether the middle of each face is in the window. */
+    const isInWindow = () =>
+        faces.every(({ axis, side }) => {
+            const [x, y, depth] = seen(side, axis);
+            return depth > 0 && x > 0 && y > 0 && x < canvas.clientWidth && y < canvas.clientHeight;
+        });
 
     /** Puts the handles to their places in the window; those behind the camera are hidden. */
     function place() {
         for (const { axis, side, handle } of faces) {
-            const [x, y, depth] = project(model(), middle(side, axis), canvas.clientWidth, canvas.clientHeight);
+            const [x, y, depth] = seen(side, axis);
             handle.hidden = depth <= 0;
             handle.style.transform = `translate(${x}px, ${y}px) translate(-50%, -50%)`;
             handle.style.zIndex = String(Math.round(1e5 / (1 + Math.max(depth, 0))));
@@ -166,13 +196,15 @@ export function addBox({ edits, centers, canvas, overlay, model, select, show })
             "div.snow-sides",
             {},
             make("b", {}, name),
-            ...faces.filter(face => face.axis === k).map(face => face.slider),
+            ...faces.filter(face => face.axis === k).flatMap(face => [face.slider, face.number]),
         ),
     );
     return {
-        element: make("div", {}, make("p", {}, say("edit_box_how")), ...sliders, button("edit_outside", selectOutside)),
+        element: make("div", {}, ...sliders, button("edit_outside", selectOutside)),
         choose() {
             handles.hidden = false;
+            if (!framed && !isInWindow()) frame(ROOM);
+            framed = true;
         },
         leave() {
             handles.hidden = true;

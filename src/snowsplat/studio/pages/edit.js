@@ -6,6 +6,7 @@ import { DELETED, Edits, SELECTED } from "./edits.js";
 import { addLevel } from "./level.js";
 import { addNotes, notesOf } from "./notes.js";
 import { addOverlay } from "./overlay.js";
+import { icon } from "./icons.js";
 import { button, make } from "./page.js";
 import { painter } from "./painting.js";
 import { addPlacement } from "./placement.js";
@@ -15,6 +16,45 @@ import { times } from "./selection.js";
 import { addShapes } from "./shapes.js";
 import { say } from "./text.js";
 import { UNTURNED } from "./turning.js";
+
+/** The keys of the tools; those of the viewer are others. */
+const KEYS = /** @type {Record<string, string>} */ ({
+    rectangle: "M",
+    lasso: "L",
+    brush: "B",
+    box: "C",
+    measure: "T",
+    note: "N",
+    level: "U",
+    delete: "Del",
+    undo: "Ctrl Z",
+    redo: "Ctrl Y",
+});
+const SELECTING = 4; // the first tools select
+const LETTERS = new Map(
+    Object.entries(KEYS)
+        .filter(([, key]) => key.length === 1)
+        .map(([name, key]) => [key.toLowerCase(), name]),
+);
+
+/** A button with an icon and its key. */
+function keyButton(/** @type {string} */ name, /** @type {(event: any) => void} */ click) {
+    const made = button(`edit_${name}`, click);
+    made.classList.add("snow-tool");
+    made.prepend(icon(name));
+    made.dataset.key = KEYS[name];
+    made.setAttribute("aria-keyshortcuts", KEYS[name].replace("Del", "Delete").replace("Ctrl ", "Control+"));
+    return made;
+}
+
+/** Buttons with a common label. */
+const group = (/** @type {string} */ label, /** @type {HTMLElement[]} */ ...buttons) =>
+    make(
+        "div.snow-group",
+        { role: "group", "aria-label": say(label) },
+        make("small", {}, say(label)),
+        make("div.snow-buttons", {}, ...buttons),
+    );
 
 /**
  * A tool for the window.
@@ -37,6 +77,7 @@ import { UNTURNED } from "./turning.js";
  * @property {Float32Array} centers
  * @property {any} scene
  * @property {HTMLCanvasElement} canvas
+ * @property {(times: number) => void} frame shows so many times the radius of the subject
  * @property {() => number[]} presentView
  * @property {ReturnType<typeof addOverlay>} overlay
  * @property {ReturnType<typeof addPlacement>} placement
@@ -66,10 +107,10 @@ export async function centersOf(/** @type {any} */ app) {
  * @param {boolean} isWhole whether the page is only for editing; another one shows levels of detail
  */
 export function addEditor(page, picker, centers, version, isEdited, isWhole) {
-    const { viewer, scene, camera, canvas, hiding, panel, presentView } = page;
+    const { viewer, scene, camera, canvas, hiding, panel, presentView, frame } = page;
     const { app } = viewer;
     const entity = app.root.findByName("gsplat");
-    const edits = new Edits(centers.length / 3, notesOf(page), boxAround(centers));
+    const edits = new Edits(centers.length / 3, notesOf(page), boxAround(centers, scene.subject));
     const placement = addPlacement(page, edits);
     const overlay = addOverlay(canvas);
     const told = make("p", { role: "status" });
@@ -89,10 +130,7 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
             paint((painted = state));
             marked = edits.counts();
         }
-        counts.textContent =
-            !marked[SELECTED] && !marked[DELETED]
-                ? say("edit_first")
-                : say("edit_counts", marked[SELECTED].toLocaleString(), marked[DELETED].toLocaleString());
+        counts.textContent = say("edit_counts", marked[SELECTED].toLocaleString(), marked[DELETED].toLocaleString());
         remove.disabled = !marked[SELECTED];
         undo.disabled = !edits.past.length;
         redo.disabled = !edits.future.length;
@@ -117,9 +155,10 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
 
     // The tools
 
-    const choices = (/** @type {Iterable<string>} */ list, /** @type {(name: string) => void} */ choose) => {
-        const names = [...list];
-        const buttons = names.map(name => button(`edit_${name}`, () => choose(name)));
+    const choices = (/** @type {string[]} */ names, /** @type {(name: string) => void} */ choose) => {
+        const buttons = names.map(name =>
+            name in KEYS ? keyButton(name, () => choose(name)) : button(`edit_${name}`, () => choose(name)),
+        );
         const mark = (/** @type {string} */ chosen) =>
             buttons.forEach((each, i) => (each.ariaPressed = String(names[i] === chosen)));
         return { buttons, mark };
@@ -127,9 +166,8 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
     let tool = "";
     let mode = "replace";
     const modes = choices(["replace", "add", "remove"], name => modes.mark((mode = name)));
-    const forSelection = make(
-        "div.snow-buttons",
-        { role: "group", "aria-label": say("edit_mode") },
+    const forSelection = group(
+        "edit_mode",
         ...modes.buttons,
         button(
             "edit_invert",
@@ -143,6 +181,7 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
         centers,
         scene,
         canvas,
+        frame,
         presentView,
         overlay,
         placement,
@@ -171,7 +210,7 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
         }),
     );
     const forTools = new Set(tools.values());
-    const toolButtons = choices(tools.keys(), name => choose(tool === name ? "" : name));
+    const toolButtons = choices([...tools.keys()], name => choose(tool === name ? "" : name));
     function choose(/** @type {string} */ name) {
         const chosen = tools.get((tool = name));
         toolButtons.mark(name);
@@ -201,16 +240,16 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
 
     // The panel
 
-    const remove = button(
-        "edit_delete",
+    const remove = keyButton(
+        "delete",
         change(() => edits.delete()),
     );
-    const undo = button(
-        "edit_undo",
+    const undo = keyButton(
+        "undo",
         change(() => go("undo")),
     );
-    const redo = button(
-        "edit_redo",
+    const redo = keyButton(
+        "redo",
         change(() => go("redo")),
     );
     function go(/** @type {"undo" | "redo"} */ way) {
@@ -225,8 +264,9 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
     const content = make(
         "div.snow-edit.snow-tools.snow-card",
         { hidden: true },
-        row(...toolButtons.buttons),
+        group("edit_select", ...toolButtons.buttons.slice(0, SELECTING)),
         forSelection,
+        group("edit_scene", ...toolButtons.buttons.slice(SELECTING)),
         ...[...forTools].map(each => each.element),
         saving.hides,
         row(remove, undo, redo),
@@ -234,9 +274,16 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
         row(saving.title, saving.view),
         row(saving.save, isEdited && saving.back),
         told,
+        make(
+            "details",
+            {},
+            make("summary", {}, say("edit_help")),
+            ...["edit_first", "edit_keys", "edit_box_how"].map(key => make("p", {}, say(key))),
+        ),
     );
     const open = button("edit", () => {
         content.hidden = !content.hidden;
+        panel.classList.remove("snow-faded");
         open.ariaExpanded = String(!content.hidden);
         if (content.hidden) choose("");
     });
@@ -271,6 +318,7 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
             else if (command && key === "y") change(() => go("redo"))();
             else if (key === "delete" || key === "backspace") change(() => edits.delete())();
             else if (key === "escape" && tool) choose("");
+            else if (!command && !event.altKey && LETTERS.has(key)) choose(/** @type {string} */ (LETTERS.get(key)));
             else return;
             event.preventDefault();
             event.stopPropagation();

@@ -6,19 +6,44 @@ import { say, told } from "./text.js";
 
 const SIZES = ["1920x1080", "1080x1920", "1080x1080"];
 const TURN = 8; // keys of a turn around the target
+const GAP = (110 * Math.PI) / 180; // a wider one between photos has nothing to show, as for `render --path`
 const FASTEST = 3; // the speeds at a key are from 1/8 to 8, in steps of the square root of 2
 const ADDRESS = "../film"; // relative to the page
 
 /**
- * Views around the target of a view, at equal angles about the vertical, beginning with it.
+ * Views around the target of a view, turned by angles about the vertical.
  * @param {number[]} view position, target, field of view, aspect
- * @param {number} count
+ * @param {number[]} angles radians
  */
-export function around([x, y, z, u, v, w, ...lens], count) {
-    return Array.from({ length: count }, (_, i) => {
-        const [sine, cosine] = [Math.sin((2 * Math.PI * i) / count), Math.cos((2 * Math.PI * i) / count)];
+export function around([x, y, z, u, v, w, ...lens], angles) {
+    return angles.map(angle => {
+        const [sine, cosine] = [Math.sin(angle), Math.cos(angle)];
         return [u + cosine * (x - u) + sine * (z - w), y, w + cosine * (z - w) - sine * (x - u), u, v, w, ...lens];
     });
+}
+
+/**
+ * The angles of a turn: all round, beginning with the view; or, if photos show one side only, there and
+ * back over that side.
+ * @param {number[]} view position, target, field of view, aspect
+ * @param {number[][]} photos views of photos
+ * @param {number} count
+ */
+export function turnOver([x, , z, u, , w], photos, count) {
+    const whole = Array.from({ length: count }, (_, i) => (2 * Math.PI * i) / count);
+    const own = Math.atan2(z - w, x - u);
+    // As angles of a turn from the view, in increasing order.
+    const seen = photos
+        .map(photo => (own - Math.atan2(photo[2] - w, photo[0] - u) + 4 * Math.PI) % (2 * Math.PI))
+        .sort((a, b) => a - b);
+    if (!seen.length) return whole;
+    const gaps = seen.map((angle, i) => (seen[i + 1] ?? seen[0] + 2 * Math.PI) - angle);
+    const widest = gaps.indexOf(Math.max(...gaps));
+    if (gaps[widest] < GAP) return whole;
+    const from = seen[(widest + 1) % seen.length];
+    const arc = 2 * Math.PI - gaps[widest];
+    // A swing: as a pendulum, its keys are closer to each other at its ends.
+    return whole.map(angle => from + (arc * (1 - Math.cos(angle))) / 2);
 }
 
 /**
@@ -150,7 +175,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         changed();
     });
     const turn = button("film_turn", () => {
-        keys = around(view(), TURN).map(each => ({ view: each, speed: 1 }));
+        keys = around(view(), turnOver(view(), scene.stops, TURN)).map(each => ({ view: each, speed: 1 }));
         chosen = TURN - 1;
         loop.checked = true;
         ease.checked = false;

@@ -6,6 +6,7 @@ import { about, levelling } from "./turning.js";
 
 const AXES = ["x", "y", "z"];
 const FINE = 15; // degrees to both sides of a slider
+const degreesOf = (/** @type {HTMLInputElement} */ slider) => `${Number(slider.value).toFixed(1)}°`;
 
 /** @param {import("./edit.js").Editing} editing */
 export function addLevel({ edits, overlay, world, placement, presentView, draw, change, show, tell }) {
@@ -30,14 +31,19 @@ export function addLevel({ edits, overlay, world, placement, presentView, draw, 
                 step: "any",
                 value: 0,
                 "aria-label": say("edit_turn_fine", axis),
-                input: () => placement.show(about(k, Number(fine.value))),
+                input: () => {
+                    placement.show(about(k, Number(fine.value)));
+                    angle.textContent = degreesOf(fine);
+                },
                 change: change(() => {
                     if (Number(fine.value)) edits.turnBy(about(k, Number(fine.value)));
                     fine.value = "0";
+                    angle.textContent = degreesOf(fine);
                 }),
             })
         );
-        return make("div.snow-turn", {}, make("b", {}, axis), by(-90), fine, by(90));
+        const angle = make("output", {}, degreesOf(fine));
+        return make("div.snow-turn", {}, make("b", {}, axis), by(-90), fine, angle, by(90));
     });
     const told = make("p", { role: "status" });
 

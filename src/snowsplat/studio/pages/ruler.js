@@ -2,6 +2,7 @@
 
 import { button, make } from "./page.js";
 import { say } from "./text.js";
+import { lengthOf } from "./units.js";
 
 /** @param {import("./edit.js").Editing} editing */
 export function addRuler({ edits, scene, overlay, world, placement, draw, show }) {
@@ -20,25 +21,22 @@ export function addRuler({ edits, scene, overlay, world, placement, draw, show }
     const rescale = button("edit_rescale", () => {
         const wanted = Number(truth.value);
         if (!(wanted > 0)) return truth.focus();
-        edits.change({ scale: (edits.present.scale * wanted) / distance() });
+        edits.change({ scale: (wanted * scene.scale) / distance() });
         show();
     });
     const size = make("span");
 
-    /** The measured distance in units of the scene that is saved; 0 if there is none. */
+    /** The measured distance in units of the page; 0 if there is none. */
     function distance() {
         if (measured.length < 2) return 0;
         const [a, b] = measured;
-        return (edits.present.scale * Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2])) / scene.scale;
+        return Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
     }
 
     function tell() {
         const { scale } = edits.present;
         const found = distance();
-        // Set scale makes a unit of the scene that is saved a metre.
-        const metres = scale === 1 ? scene.metres : 1;
-        const length = metres ? `${(metres * found).toPrecision(4)} m` : found.toPrecision(4);
-        told.textContent = found ? say("edit_distance", length) : say("edit_two_points");
+        told.textContent = found ? say("edit_distance", lengthOf({ edits, scene }, found, 4)) : say("edit_two_points");
         rescale.disabled = !found;
         size.textContent = scale === 1 ? "" : say("edit_size", scale.toPrecision(4));
     }

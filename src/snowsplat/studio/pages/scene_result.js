@@ -4,6 +4,10 @@ import { action, ask, bytes, command, duration, make } from "./page.js";
 import { againPart } from "./scene_start.js";
 import { dressed, say, told } from "./text.js";
 
+/** Shows a site of the downloads in another page. */
+const EMBED =
+    '<iframe src="https://example.org/scene/index.html" title="3D scene" allow="fullscreen; xr-spatial-tracking" style="width: 100%; aspect-ratio: 16 / 9; border: 0"></iframe>';
+
 export function resultPart(
     /** @type {import("./scene.js").ScenePage} */ page,
     /** @type {import("./types.js").Scene} */ scene,
@@ -64,6 +68,7 @@ export function resultPart(
             make("details", {}, make("summary", {}, say("command")), ...Object.values(scene.exports).map(command)),
         ),
         film,
+        make("section.card", {}, make("h2", {}, say("embed")), make("p.soft", {}, say("embed_how")), command(EMBED)),
         phone,
         result.seconds !== null &&
             make("details.card", {}, make("summary", {}, say("again")), ...againPart(page, scene)),
@@ -122,10 +127,10 @@ async function showFilm(/** @type {HTMLElement} */ card, /** @type {string} */ a
     );
 }
 
-/** The addresses of the scene for phones, with codes. */
+/** The addresses at which the scene can be looked at, for phones with codes. */
 async function showPhone(/** @type {HTMLElement} */ card, /** @type {string} */ site) {
     /** @type {import("./types.js").About} */
-    const { addresses } = await ask(`about?path=${encodeURIComponent(site)}`).catch(() => ({ addresses: [] }));
+    const { addresses, look } = await ask(`about?path=${encodeURIComponent(site)}`).catch(() => ({ addresses: [] }));
     card.append(
         make("h2", {}, say("phone")),
         make(
@@ -138,4 +143,5 @@ async function showPhone(/** @type {HTMLElement} */ card, /** @type {string} */ 
                 : [make("p.soft", {}, say("phone_how"))]),
         ),
     );
+    if (look) card.append(make("p.soft", {}, say("look")), command(new URL(look, location.href).href));
 }

@@ -13,7 +13,9 @@ export function addShapes({ canvas, centers, overlay, model, select }) {
     /** @type {number[][]} */
     let stroke = []; // points of the window, CSS pixels
     const radius = /** @type {HTMLInputElement} */ (make("input", { type: "range", min: 4, max: 120, value: BRUSH }));
-    const element = make("label", {}, say("edit_radius"), radius);
+    const size = make("output", {}, `${BRUSH} px`);
+    const element = make("label", {}, say("edit_radius"), radius, size);
+    radius.addEventListener("input", () => (size.textContent = `${radius.value} px`));
 
     /** Draws the stroke as a rectangle, an area or a line. */
     function trace(/** @type {CanvasRenderingContext2D} */ context) {

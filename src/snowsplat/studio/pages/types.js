@@ -55,7 +55,7 @@
 /** @typedef {{path: string, size: number, modified: number, received: number}} Arrived */
 /** @typedef {{name: string, placed: boolean}} Photo */
 /** @typedef {{path: string, parent: string, folders: string[], files: string[], photos: number}} Listing */
-/** @typedef {{folder: string, addresses: {url: string, code: string}[]}} About */
+/** @typedef {{folder?: string, look?: string, addresses: {url: string, code: string}[]}} About */
 
 /**
  * What the photos are, whether they are few, and seconds by quality; or the finished scene that was given.

@@ -3,53 +3,25 @@
 // of the shape `aspect`. The window shows all of it, whatever its own shape, unless no photo shows
 // what is beside it: at a photo, the window then shows a part of the rectangle, which fills it.
 const scene = JSON.parse(document.getElementById("sse-bootstrap").textContent).panel;
-const { aspect, seen, stops } = scene;
-const NARROW = 600;
+const { aspect, limits: limitsOf, stops, start, first } = scene;
 
-const UNLIMITED = [Infinity, Infinity];
+const UNLIMITED = [Infinity, Infinity, 0, 0];
 
 /**
  * Half of the width and of the height of what the window shows at a distance of 1: the rectangle,
- * but at most so many times its width and its height.
+ * but at most so many times its width and its height, unless the core of the subject would be cut,
+ * which is so wide and high.
  */
-const shownBy = (fov, { width, height }, [widest, highest] = UNLIMITED) => {
+const shownBy = (fov, { width, height }, [widest, highest, wide, high] = UNLIMITED) => {
     const longer = Math.tan((fov * Math.PI) / 360);
     const [across, down] = [(longer * Math.min(aspect, 1) * height) / width, longer / Math.max(aspect, 1)];
-    const half = Math.min(Math.max(down, across), widest * across, highest * down);
+    const limit = Math.max(Math.min(widest * across, highest * down), high, (wide * height) / width);
+    const half = Math.min(Math.max(down, across), limit);
     return [(half * width) / height, half];
 };
 
 /** The share of what the window would show of a rectangle, if it were not limited. */
 const zoomWithin = (fov, size, limits) => shownBy(fov, size, limits)[1] / shownBy(fov, size)[1];
-
-/** How much of the radius of the subject is in the window, above, below and at the sides; at most 1. */
-const shownOfSubject = ([x, y, z, u, v, w, fov], size, limits) => {
-    const scaled = a => a.map(value => value / Math.hypot(...a));
-    const cross = ([a, b, c], [d, e, f]) => [b * f - c * e, c * d - a * f, a * e - b * d];
-    const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
-    const ahead = scaled([u - x, v - y, w - z]);
-    const right = scaled(cross(ahead, [0, 1, 0]));
-    const to = [scene.subject[0] - x, scene.subject[1] - y, scene.subject[2] - z];
-    const distance = dot(to, ahead);
-    if (distance <= 0) return -Infinity;
-    const [across, down] = shownBy(fov, size, limits);
-    const beside = [
-        across * distance - Math.abs(dot(to, right)),
-        down * distance - Math.abs(dot(to, cross(right, ahead))),
-    ];
-    return Math.min(1, Math.min(...beside) / scene.subject[3]);
-};
-
-/** The page begins with the first photo, or if it would show little of it, with one that shows the subject. */
-const ENOUGH = 0.8;
-const firstStop = size => {
-    if (!stops.length || zoomWithin(stops[0][6], size, seen[0]) >= ENOUGH) return 0;
-    const shown = stops.map((view, i) => shownOfSubject(view, size, seen[i]));
-    return shown.findIndex(share => share >= Math.max(...shown) - 0.05);
-};
-// A start that a person has chosen is that of no photo.
-const first = scene.chosen ? -1 : Math.max(0, firstStop({ width: innerWidth, height: innerHeight }));
-const start = first > 0 ? stops[first] : scene.start;
 
 const addView = ([x, y, z, u, v, w, fov]) => ({ position: [x, y, z], target: [u, v, w], fov });
 
@@ -85,7 +57,7 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
     // The viewer sets the field of view before each frame, once the scene is loaded.
     let fov = start[6];
     let fitted = 0;
-    let limits = linkedView() ? UNLIMITED : (seen[first] ?? UNLIMITED);
+    let limits = linkedView() ? UNLIMITED : (limitsOf[first] ?? UNLIMITED);
     let zoom = zoomWithin(fov, canvas, limits);
     app.on("update", seconds => {
         if (app.xr.active) return;
@@ -97,16 +69,7 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
     });
     new ResizeObserver(() => {
         zoom = zoomWithin(fov, canvas, limits);
-        closeControls();
     }).observe(canvas);
-
-    // The list of controls would cover the scene in a window that is, or becomes, narrow; a button opens it.
-    let narrow = false;
-    const closeControls = () => {
-        const before = narrow;
-        narrow = state.loaded && canvas.clientWidth < NARROW;
-        if (narrow && !before) document.querySelector(".sse-controlsHintClose")?.click();
-    };
 
     /** Move to a view, in orbit around its target; for the view of a photo, with its limits. */
     const flyTo = (view, limitsThere = UNLIMITED) => {
@@ -128,10 +91,10 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
         return [x, y, z, x + far * ahead.x, y + far * ahead.y, z + far * ahead.z, shown];
     };
 
-    /** The subject from the present direction, whole and large. */
-    const subjectView = () => {
+    /** The subject, or so many times its radius, from the present direction, whole and large. */
+    const subjectView = (times = 1) => {
         const { x, y, z } = camera.entity.forward;
-        const distance = radius / Math.sin(Math.atan(Math.min(...shownBy(start[6], canvas))));
+        const distance = (times * radius) / Math.sin(Math.atan(Math.min(...shownBy(start[6], canvas))));
         const [u, v, w] = subject;
         return [u - distance * x, v - distance * y, w - distance * z, u, v, w, start[6]];
     };
@@ -140,15 +103,17 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
         // In orbit; the viewer itself would begin in its animation.
         viewer.resetCamera();
         hiding.set(linkedHiding() ?? scene.hiding.start);
-        closeControls();
+        // The list of controls would cover the scene; a button opens it.
+        document.querySelector(".sse-controlsHintClose")?.click();
         // These follow the viewer's own handlers.
         events.on("inputEvent", name => {
             if (name === "frame") flyTo(subjectView());
-            if (name === "reset" && state.cameraMode === "orbit") flyTo(start, seen[first]);
+            if (name === "reset" && state.cameraMode === "orbit") flyTo(start, limitsOf[first]);
         });
         // The film passes all photos.
         events.on("cameraMode:changed", mode => {
-            if (mode === "anim" && seen.length) limits = [0, 1].map(i => Math.min(...seen.map(each => each[i])));
+            if (mode !== "anim" || !stops.length) return;
+            limits = [...[0, 1].map(i => Math.min(...limitsOf.map(each => each[i]))), 0, 0];
         });
         window.addEventListener("hashchange", () => {
             const view = linkedView();
@@ -212,7 +177,7 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
         stop.onclick = () => {
             strip.querySelector("[aria-current]")?.removeAttribute("aria-current");
             stop.ariaCurrent = "true";
-            flyTo(view, seen[i]);
+            flyTo(view, limitsOf[i]);
         };
         strip.append(stop);
     });
@@ -246,5 +211,6 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
     document.querySelector(".sse-viewer").append(panel);
     events.on("loaded:changed", () => document.querySelector(".snow-failure")?.remove());
     // The studio adds its tools.
-    window.sse.tools?.({ viewer, scene, camera, canvas, hiding, panel, presentView, flyTo });
+    const frame = times => flyTo(subjectView(times));
+    window.sse.tools?.({ viewer, scene, camera, canvas, hiding, panel, presentView, flyTo, frame });
 });

@@ -95,14 +95,14 @@ def panel_settings(
     hiding: Hiding,
     scale: float,
     metres: float | None,
-    chosen: bool,
+    first: int,
 ) -> dict[str, Any]:
     """What the script needs.
 
     ``gaussians``: their number. ``start``: the initial view. ``stops``: also have the subject,
     which Frame shows. ``pictures``: the address of the image with the pictures of the stops.
     ``scale``: of the page relative to the scene file. ``metres``: in a unit of the scene file, if
-    that is known. ``chosen``: a person has chosen the start.
+    that is known. ``first``: the stop that is the start; -1: it is none.
     """
     x, y, z = stops.middle.tolist()
     return {
@@ -113,12 +113,15 @@ def panel_settings(
         "start": view_numbers(start, start.aspect),
         "subject": [-x, -y, z, stops.radius],
         "stops": [view_numbers(stop, start.aspect) for stop in stops.views],
-        "seen": [[round(share, 2) for share in seen] for seen in stops.seen],
+        "limits": [
+            [round(number, 4) for number in (*seen, *held)]
+            for seen, held in zip(stops.seen, stops.held, strict=True)
+        ],
         "pictures": pictures,
         "hiding": hiding.settings(),
         "scale": scale,
         "metres": metres,
-        "chosen": chosen,
+        "first": first,
     }
 
 

@@ -142,7 +142,7 @@ def _tags(properties: Mapping[str, str]) -> str:
 
 def _poster(scene: ReadyScene) -> bytes:
     """The initial view as a JPEG file."""
-    camera = scene.start.camera(*POSTER_SIZE)
+    camera = scene.camera(*POSTER_SIZE)
     with torch.no_grad():
         shown = scene.hiding.shown(scene.gaussians.detach())
         image = render(shown, camera, torch.tensor(scene.background)).image

@@ -26,7 +26,7 @@ from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.static import Served, ServedFile, served
 from snowsplat.viewer.web.panel import Description, Hiding, hiding_of, panel_settings
-from snowsplat.viewer.web.stops import Stops, stops_of
+from snowsplat.viewer.web.stops import Stops, first_stop, shown_at, stops_of
 from snowsplat.viewer.web.viewer_page import asset, content_policy, page, script
 from snowsplat.viewer.web.viewer_settings import Annotation, settings
 
@@ -99,8 +99,14 @@ class ReadyScene(NamedTuple):
     hiding: Hiding  # what the page can hide
     scale: float  # of the frame, relative to that of the scene that was given
     metres: float | None  # in a unit of the scene that was given, if that is known
-    chosen: bool  # whether the initial view was given
+    first: int  # the stop of the initial view; -1: it was given, or there are no stops
     notes: Sequence[Annotation] = ()
+
+    def camera(self, width: int, height: int) -> Camera:
+        """What a window of this size, in pixels, shows at first."""
+        if self.first < 0:
+            return self.start.camera(width, height)
+        return shown_at(self.stops, self.first, width, height)
 
     def complete(self) -> ReadyScene:
         """Nothing is hidden at first; for levels of detail, whose coarse Gaussians are large."""
@@ -127,7 +133,7 @@ class ReadyScene(NamedTuple):
                 self.hiding,
                 self.scale,
                 self.metres,
-                self.chosen,
+                self.first,
             ),
         }
 
@@ -143,7 +149,7 @@ def ready(
 ) -> ReadyScene:
     """The scene in a frame that suits the viewer, and views in that frame.
 
-    ``start``: the initial view; None: that of the first camera, or an overview. ``turn``: see
+    ``start``: the initial view; None: the `first_stop`, or an overview. ``turn``: see
     `viewing_frame`.
     """
     change, depth = viewing_frame(gaussians, cameras, turn=turn)
@@ -157,11 +163,11 @@ def ready(
     stops = stops_of(gaussians, cameras, depth if cameras else 1.0, background)
     hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=not cameras)
     film = _film(cameras, depth) if cameras else []
-    first = start or (stops.views[0] if cameras else overview(gaussians))
+    first = first_stop(stops) if cameras and start is None else -1
+    start = start or (stops.view(first) if cameras else overview(gaussians))
     scale = change.scale if change else 1.0
-    chosen = start is not None
     return ReadyScene(
-        gaussians, first, film, stops, background, hiding, scale, metres, chosen, notes
+        gaussians, start, film, stops, background, hiding, scale, metres, first, notes
     )
 
 

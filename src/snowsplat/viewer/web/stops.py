@@ -10,6 +10,7 @@ left to right.
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -33,10 +34,13 @@ HEIGHT = 128
 # share of what the middle parts of the photos show, of this size relative to a photo.
 _MIDDLE = 0.6
 _SHARE = 0.9
+_CORE = 0.5  # and its core this one
 # Beside a photo, so many widths or heights of it are looked at, in a picture of this height.
 _WIDEST, _BESIDE_HEIGHT = 3.0, 24
 # This share of what is shown beside a photo must be in other photos. At most so many are compared.
 _SEEN_SHARE, _COMPARED = 0.85, 100
+# A stop holds the subject as well as another one if less than this is missing.
+_AS_WELL = 0.3
 
 
 class Stops(NamedTuple):
@@ -49,6 +53,13 @@ class Stops(NamedTuple):
     # For each stop, the largest width and height, relative to those of its view, of which photos
     # show most of what is beside the view; 1 to 3.
     seen: list[tuple[float, float]]
+    # For each stop, half of the width and of the height, at a distance of 1, that hold the core of
+    # the subject, which has half of what the radius has.
+    held: list[tuple[float, float]]
+
+    def view(self, stop: int) -> InitialView:
+        """A stop as the page shows it: all views have the shape of the first photo."""
+        return self.views[stop].with_aspect(self.views[0].aspect)
 
 
 def stops_of(
@@ -60,7 +71,7 @@ def stops_of(
     ``depth``: the distance of the targets of the views. ``background``: red, green, blue in 0..1.
     """
     if not cameras:
-        return Stops([], b"", *bounding_sphere(gaussians), [])
+        return Stops([], b"", *bounding_sphere(gaussians), [], [])
     numbers = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST)).round().long().tolist()
     views = [view_of_camera(cameras[i], depth) for i in numbers]
     width = max(1, round(HEIGHT * views[0].aspect))
@@ -68,11 +79,44 @@ def stops_of(
     middle = focus_of(cameras, depth)
     distances = (torch.cat([points for _, points in looks]) - middle).norm(dim=1)
     distances = distances[distances < (positions_of(cameras) - middle).norm(dim=1).median()]
-    radius = float(distances.quantile(_SHARE)) if len(distances) else depth
+    radius, core = (
+        float(distances.quantile(share)) if len(distances) else depth for share in (_SHARE, _CORE)
+    )
     others = cameras[:: -(-len(cameras) // _COMPARED)]
     seen = [_seen(gaussians, view.with_aspect(views[0].aspect), depth, others) for view in views]
     pictures = _side_by_side([picture for picture, _ in looks])
-    return Stops(views, pictures, middle, max(radius, 1e-6), seen)
+    held = [_held(view, middle, core) for view in views]
+    return Stops(views, pictures, middle, max(radius, 1e-6), seen, held)
+
+
+def first_stop(stops: Stops) -> int:
+    """The stop with which a page begins: the first whose photo has as much of the core of the
+    subject as any other. Windows of every shape show it; it has no use without stops."""
+    shares = []
+    for view, held in zip(stops.views, stops.held, strict=True):
+        across, down = view.tangents()
+        shares.append(min(1.0, across / held[0], down / held[1]))
+    return next(i for i, share in enumerate(shares) if share >= max(shares) - _AS_WELL)
+
+
+def shown_at(stops: Stops, stop: int, width: int, height: int) -> Camera:
+    """The camera of a window of this size, in pixels, at a stop.
+
+    The window shows the rectangle of the view, but nothing that no photo shows, unless the core of
+    the subject would be cut. `panel.js` does the same.
+    """
+    view = stops.view(stop)
+    across, down = view.tangents()
+    (wide, high), (left, up), aspect = stops.seen[stop], stops.held[stop], width / height
+    limit = max(min(wide * across / aspect, high * down), up, left / aspect)
+    focal = 0.5 * height / min(max(down, across / aspect), limit)
+    return replace(view.camera(width, height), fx=focal, fy=focal)
+
+
+def _held(view: InitialView, middle: Tensor, radius: float) -> tuple[float, float]:
+    """Half of the width and of the height, at a distance of 1, that hold a sphere."""
+    x, y, ahead = transform_points(view.camera(2, 2).cam_from_world, middle[None])[0].tolist()
+    return tuple((abs(side) + radius) / ahead if ahead > 0 else math.inf for side in (x, y))
 
 
 def _look(
