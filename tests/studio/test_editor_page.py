@@ -69,7 +69,8 @@ def place_of(page: Page, across: float, z: float) -> tuple[float, float]:
         f".set({across * math.cos(TILT)}, {-across * math.sin(TILT)}, {z});"
         "root.findByName('gsplat').getWorldTransform().transformPoint(point, point);"
         "const { x, y } = root.findByName('camera').camera.worldToScreen(point);"
-        "return [x, y]; })()"
+        "const { left, top } = document.querySelector('canvas').getBoundingClientRect();"
+        "return [left + x, top + y]; })()"
     )
     return x, y
 

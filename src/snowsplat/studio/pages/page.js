@@ -112,7 +112,7 @@ export function command(/** @type {string} */ line) {
     return make(
         "div.command",
         {},
-        make("code", {}, line),
+        make("code", { tabindex: 0 }, line), // the keyboard scrolls it
         // Browsers give the clipboard only to pages of this machine, or with https.
         navigator.clipboard && make("button.plain", { type: "button", click: copy }, say("copy")),
     );

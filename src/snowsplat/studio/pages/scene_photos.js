@@ -22,7 +22,11 @@ export async function showGiven(page, element, changed) {
     /** @type {Record<string, import("./types.js").Told>} */
     const marks = (await ask(`${page.address}/marks`, "POST").catch(() => ({ marks: {} }))).marks;
     const marked = Object.entries(marks).filter(([name]) => tiles.has(name));
-    for (const [name, why] of marked) tiles.get(name)?.append(make("span.mark", {}, told(why)));
+    for (const [name, why] of marked) {
+        const photo = /** @type {HTMLElement} */ (tiles.get(name));
+        photo.append(make("span.mark", {}, told(why)));
+        if (page.uploaded) photo.ariaLabel = `${told(why)} ${say("leave_out", name)}`;
+    }
     list.prepend(...marked.map(([name]) => /** @type {HTMLElement} */ (tiles.get(name))));
     const count = marked.length ? say("marked", marked.length, photos.length) : say("unmarked");
     head.textContent = page.uploaded ? `${count} ${say("click_photo")}` : count;

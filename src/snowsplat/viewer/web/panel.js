@@ -3,7 +3,7 @@
 // of the shape `aspect`. The window shows all of it, whatever its own shape, unless no photo shows
 // what is beside it: at a photo, the window then shows a part of the rectangle, which fills it.
 const scene = JSON.parse(document.getElementById("sse-bootstrap").textContent).panel;
-const { aspect, limits: limitsOf, stops, start, first } = scene;
+const { aspect, limits: limitsOf = [], stops, start, first = -1 } = scene;
 
 const UNLIMITED = [Infinity, Infinity, 0, 0];
 
