@@ -208,7 +208,9 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
     events.on("controlsHidden:changed", hidden =>
         panel.classList.toggle("snow-faded", hidden && strip.hidden && hiding.element.hidden),
     );
-    document.querySelector(".sse-viewer").append(panel);
+    const viewerElement = document.querySelector(".sse-viewer");
+    viewerElement.role = "main";
+    viewerElement.append(panel);
     events.on("loaded:changed", () => document.querySelector(".snow-failure")?.remove());
     // The studio adds its tools.
     const frame = times => flyTo(subjectView(times));

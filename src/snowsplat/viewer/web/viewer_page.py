@@ -99,6 +99,7 @@ def page(
     text = _replaced(
         text, "<title>SuperSplat Viewer</title>", f"<title>{html.escape(title)}</title>"
     )
+    text = _replaced(text, ", maximum-scale=1.0, user-scalable=no", "")  # people may zoom texts
     # An empty icon; otherwise browsers would request one.
     icon = '<link rel="icon" href="data:," />'
     text = _replaced(text, '<base href="" />', f"{icon}\n        {head}" if head else icon)
