@@ -3,10 +3,12 @@
     python -c "from snowsplat.synthetic.photographer import write_synthetic_photos as write; \
         write('out/table', 36, 1024, 768)"
     snowsplat make out/table -o out/scenes/table
-    python docs/pictures.py out/scenes/table
+    git clone https://github.com/pierotofy/dataset_banana out/banana  # 16 photos, MIT License
+    snowsplat make out/banana/images -o out/scenes/banana --quality draft
+    python docs/pictures.py out/scenes/table out/scenes/banana
 
-Needs Chromium. Writes to docs/pictures: scene.webp (a moving picture: the camera moves around the
-scene), studio.webp (the page of the scene in the studio), globe.webp (a moving picture: the scene
+Needs Chromium. Writes to docs/pictures: scene.webp and real.webp (moving pictures: the camera moves
+around the scene), studio.webp (the page of the scene in the studio), globe.webp (a moving picture: the scene
 in a snow globe), web.webp and live.webp (the two viewers) and report.webp (the report of the
 training).
 """
@@ -15,10 +17,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from urllib.parse import quote
 
 import av
 from PIL import Image
@@ -70,15 +74,11 @@ def animate(video: Path, target: Path, fps: float, quality: int) -> None:
     )
 
 
-def click(page: Page, selector: str) -> None:
-    """Click an element, and wait until it has disappeared."""
-    found = f"document.querySelector('{selector}')"
-    page.evaluate(f"{found}.click()")
-    page.wait_for(f"!{found}?.offsetParent")
-
-
 def shoot(page: Page, target: Path) -> None:
-    """Save what a tab shows."""
+    """Save what a tab shows, with the controls of a viewer, which appear when the mouse moves."""
+    for x in (640, 642):
+        page.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=400)
+    time.sleep(1)
     Image.fromarray(page.screenshot()).save(target, quality=85, method=6)
 
 
@@ -88,10 +88,11 @@ def studio(made: Path, browser: Browser, target: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         url = next(line.split()[-1] for line in process.stdout if "http://" in line)
-        page = browser.open(f"{url}#{made.name}")
+        page = browser.open(f"{url}#{quote(made.name)}")
         page.wait_for("!!document.querySelector('iframe')", 200)
         page.wait_for("!!document.querySelector('iframe').contentWindow.app", 200)
         page.evaluate("window.scrollTo(0, 60)")
+        time.sleep(3)
         shoot(page, target)
         page.close()
         process.terminate()
@@ -116,9 +117,10 @@ def training(dataset: Path) -> Iterator[str]:
             process.terminate()
 
 
-def main(made: Path) -> None:
+def main(made: Path, real: Path) -> None:
     PICTURES.mkdir(exist_ok=True)
     film(made, PICTURES / "scene.webp")
+    film(real, PICTURES / "real.webp")
     globe(made, PICTURES / "globe.webp")
     with Browser(WIDTH, HEIGHT, frames=5.0) as browser, TemporaryDirectory() as folder:
         shoot(browser.open((made / "scene" / "report.html").as_uri()), PICTURES / "report.webp")
@@ -127,7 +129,7 @@ def main(made: Path) -> None:
         snowsplat.convert(made, html)
         page = browser.open(f"{html.as_uri()}?webgl")
         page.wait_for("!!window.app", 120)
-        click(page, ".sse-controlsHintClose")  # the list of keys
+        time.sleep(3)  # the first picture is coarse
         shoot(page, PICTURES / "web.webp")
         page.close()
         with training(made / "dataset") as url:
@@ -140,4 +142,4 @@ def main(made: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(*map(Path, sys.argv[1:]))

@@ -290,10 +290,6 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
     open.ariaExpanded = "false";
     panel.querySelector(".snow-copied").before(open);
     panel.querySelector(".snow-card").after(content);
-    // The page fades its panel when its controls hide.
-    viewer.events.on("controlsHidden:changed", () => {
-        if (!content.hidden) panel.classList.remove("snow-faded");
-    });
     // The sliders change what is saved.
     hiding.element.addEventListener("input", show);
     choose("");

@@ -376,9 +376,6 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
     open.ariaExpanded = "false";
     panel.querySelector(".snow-copied").before(open);
     panel.querySelector(".snow-card").after(content);
-    viewer.events.on("controlsHidden:changed", () => {
-        if (!content.hidden) panel.classList.remove("snow-faded");
-    });
     // Keys in fields are not for the camera.
     for (const kind of ["keydown", "keyup"])
         content.addEventListener(kind, event => {

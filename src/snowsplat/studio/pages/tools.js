@@ -12,11 +12,18 @@ const {
     version,
 } = /** @type {HTMLElement} */ (document.querySelector("script[data-page]")).dataset;
 
+const NARROW = 600; // CSS pixels, as in tools.css
+
 function addTools(/** @type {any} */ page) {
     const { app, events, state } = page.viewer;
     /** @type {any} */
     let picker;
     events.once("picker:ready", (/** @type {any} */ ready) => (picker = ready));
+    // The page fades its panel when its controls hide. It stays where there is room for it, and with a tool.
+    events.on("controlsHidden:changed", () => {
+        const isOpen = page.panel.querySelector(".snow-tools:not([hidden])") !== null;
+        if (isOpen || innerWidth >= NARROW) page.panel.classList.remove("snow-faded");
+    });
     const begin = async () => {
         const others = new Set(page.panel.querySelectorAll("button"));
         addFilm(page, version ?? "");
