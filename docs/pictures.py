@@ -8,9 +8,9 @@
     python docs/pictures.py out/scenes/table out/scenes/banana
 
 Needs Chromium. Writes to docs/pictures: scene.webp and real.webp (moving pictures: the camera moves
-around the scene), studio.webp (the page of the scene in the studio), globe.webp (a moving picture: the scene
-in a snow globe), web.webp and live.webp (the two viewers) and report.webp (the report of the
-training).
+around the scene), studio.webp (the page of the scene in the studio), globe.webp (a moving picture:
+the scene in a snow globe), web.webp and live.webp (the two viewers) and report.webp (the report of
+the training).
 """
 
 from __future__ import annotations
