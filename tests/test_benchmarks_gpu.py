@@ -8,12 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat.ops.cuda import nvrtc
 from snowsplat.ops.cuda.launches import KERNELS, launch_by
 from snowsplat.ops.native import LAUNCHERS
 
 from . import fork_server
-from .ops.test_cuda_build import kernels_in
 
 ROOT = Path(__file__).resolve().parents[1]
 BENCHMARKS = ROOT / "benchmarks"
@@ -135,19 +133,6 @@ def test_the_sanitizer_program_runs_every_kernel(fake_gpu, monkeypatch):
     gpu_ops.every_op(torch.device("cpu"), gpu_ops.SMALL, wide=False, say=lambda line: None)
     # This scene has more tiles than the emulation can process in a short time.
     assert set(KERNELS) - {name.removesuffix("_f64") for name in launched} == {"tiles_start_u32"}
-
-
-def test_the_kernel_of_the_rate_compiles(gpu_modules):
-    import gpu_parts
-
-    try:
-        compiler = nvrtc.Nvrtc(nvrtc.find((12,)))
-    except nvrtc.NotFound:
-        pytest.skip("needs NVRTC (make dev installs it where it exists)")
-    code, warnings = compiler.compile(gpu_parts.RATE, "sm_90")
-    (rate,) = kernels_in(code).values()
-    assert rate.parameters == [24]
-    assert warnings == ""
 
 
 @pytest.mark.emulated

@@ -127,14 +127,6 @@ def test_flags_with_the_values_on_and_off(value, expected):
     assert given == {"abs_grad": expected}
 
 
-def test_a_setting_of_another_recipe(refused, dataset, tmp_path):
-    line = refused(
-        "train", dataset, "-o", tmp_path / "out", "--recipe", "mcmc", "--percent-dense", 0.1
-    )
-    assert "--percent-dense" in line
-    assert not (tmp_path / "out").exists()
-
-
 # Reproducing and resuming
 
 

@@ -11,11 +11,11 @@ import ast
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import takewhile
 
 import libcst as cst
 import libcst.matchers as m
 from libcst.metadata import (
-    ByteSpanPositionProvider,
     MetadataWrapper,
     ParentNodeProvider,
     PositionProvider,
@@ -34,8 +34,6 @@ _NEVER = (
     | m.Call(m.Name(m.MatchRegex(r".*Error")))
     | m.Call(m.Attribute(m.Name("logger")))
 )
-#: The largest depth of nested blocks that is expected.
-_DEEPEST = 8
 #: Calls whose arguments are not removed or replaced: each such call would fail.
 _WHOLE_CALLS = {"len", "isinstance", "range", "super", "zip"}
 
@@ -114,7 +112,7 @@ def mutants_of(file: str, source: bytes) -> list[Mutant]:
     wrapper.visit(visitor)
     found: dict[bytes, Mutant] = {}
     for node, changed in visitor.changes:
-        mutated = _mutated(source, wrapper, node, changed)
+        mutated = cst.ensure_type(wrapper.module.deep_replace(node, changed), cst.Module).bytes
         if mutated not in found and mutated != source and _parses(mutated):
             line, was, becomes = _changed_lines(source, mutated)
             lines = _executed_lines(wrapper, node)
@@ -135,7 +133,7 @@ def _parses(source: bytes) -> bool:
 class _Visitor(cst.CSTVisitor):
     """Collects pairs of a node and a changed node that replaces it."""
 
-    METADATA_DEPENDENCIES = (PositionProvider, ByteSpanPositionProvider, ParentNodeProvider)
+    METADATA_DEPENDENCIES = (PositionProvider, ParentNodeProvider)
 
     def __init__(self) -> None:
         super().__init__()
@@ -190,48 +188,20 @@ def _branch_of_a_gpu(node: cst.If | cst.IfExp) -> cst.CSTNode | None:
     return node.orelse if is_cpu else node.body if is_gpu else None
 
 
-def _mutated(
-    source: bytes, wrapper: MetadataWrapper, node: cst.CSTNode, changed: cst.CSTNode
-) -> bytes:
-    """The file in which ``changed`` replaces ``node``."""
-    module = wrapper.module
-    spans = wrapper.resolve(ByteSpanPositionProvider)
-    # The span of a node does not always contain exactly its code, for example if the node is in
-    # parentheses. In this case, the node around it is replaced.
-    while node is not module:
-        start = spans[node].start if node in spans else 0
-        end = start + spans[node].length if node in spans else 0
-        # The generated code of a node does not have the indentation of its block, so every
-        # possible indentation is tried.
-        for depth in range(_DEEPEST if end else 0):
-            newline = "\n" + depth * module.default_indent
-            code, text = (
-                module.code_for_node(n).strip().replace("\n", newline).encode()
-                for n in (node, changed)
-            )
-            if code and source[start:end] == code:
-                return source[:start] + text + source[end:]
-            if b"\n" not in code:
-                break
-        parent = wrapper.resolve(ParentNodeProvider)[node]
-        changed = cst.ensure_type(parent.deep_replace(node, changed), cst.CSTNode)
-        node = parent
-    return cst.ensure_type(changed, cst.Module).bytes
-
-
 def _changed_lines(before: bytes, after: bytes) -> tuple[int, str, str]:
     """Number of the first changed line, from 1, and the changed lines before and after."""
     was, becomes = before.decode().splitlines(), after.decode().splitlines()
-    shorter = min(len(was), len(becomes))
-    first = next((i for i in range(shorter) if was[i] != becomes[i]), shorter)
-    same = range(shorter - first)
-    last = next((i for i in same if was[-1 - i] != becomes[-1 - i]), shorter - first)
-    was, becomes = was[first : len(was) - last], becomes[first : len(becomes) - last]
-    return first + 1, _stripped(was), _stripped(becomes)
+    first = _common(was, becomes)
+    last = _common(was[first:][::-1], becomes[first:][::-1])
+    return first + 1, *(
+        "\n".join(line.strip() for line in lines[first : len(lines) - last])
+        for lines in (was, becomes)
+    )
 
 
-def _stripped(lines: list[str]) -> str:
-    return "\n".join(line.strip() for line in lines)
+def _common(a: list[str], b: list[str]) -> int:
+    """How many lines at the start are the same."""
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(a, b, strict=False)))
 
 
 def _executed_lines(wrapper: MetadataWrapper, node: cst.CSTNode) -> range | None:

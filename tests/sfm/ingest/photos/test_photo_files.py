@@ -174,26 +174,6 @@ def test_a_jpeg_is_decoded_at_a_smaller_size_but_read_completely(tmp_path):
         decode_small(tmp_path / "a.jpg", 320)
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow warns of damaged tags
-@pytest.mark.parametrize("ending", ["jpg", "png", "tif", "webp", "heic"])
-def test_any_damage_raises_unusable(ending, tmp_path):
-    pillow_heif.register_heif_opener()
-    path = tmp_path / f"a.{ending}"
-    photo(width=160, height=120).save(path)
-    content = path.read_bytes()
-    refused = 0
-    for i in range(40):
-        damaged = bytearray(content[: len(content) * (i + 1) // 20] if i < 20 else content)
-        position = (i * 7919) % (100 if i % 2 else len(damaged))
-        damaged[position % len(damaged)] ^= 1 << i % 8
-        path.write_bytes(damaged)
-        try:
-            decode(path, read_header(path), None)
-        except Unusable:
-            refused += 1
-    assert refused > 5
-
-
 def test_text_files_and_icons(tmp_path):
     (tmp_path / "a.jpg").write_text("not a photo")
     with pytest.raises(Unusable, match="not an image of a known format"):
