@@ -69,13 +69,6 @@ def test_equation_9_as_the_paper_writes_it(opacity, copies):
     assert float(shrink) == pytest.approx(opacity / total, rel=1e-6)
 
 
-def test_a_single_copy_is_unchanged():
-    opacities = torch.tensor([0.1, 0.5, 0.99])
-    new, shrink = shared_opacity(opacities, torch.ones(3, dtype=torch.int64))
-    torch.testing.assert_close(new, opacities)
-    torch.testing.assert_close(shrink, torch.ones(3))
-
-
 def test_opaque_gaussians_and_many_copies_stay_finite():
     new, shrink = shared_opacity(torch.tensor([1.0, 1.0, 1e-6]), torch.tensor([51, 1000, 1000]))
     assert ((new > 0) & (new < 1)).all()
