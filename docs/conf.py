@@ -39,6 +39,9 @@ myst_enable_extensions = ["dollarmath"]
 html_theme = "furo"
 html_title = f"snowsplat {release}"
 html_static_path = ["static"]
+# The scenes of the gallery, if docs/gallery.py has made them.
+_GALLERY = _DOCS.parent / "build" / "gallery"
+html_extra_path = [str(_GALLERY)] if _GALLERY.is_dir() else []
 html_css_files = ["site.css"]
 html_js_files = [
     ("basin.js", {"defer": "defer"}),
