@@ -11,19 +11,9 @@ from snowsplat.formats import ply, read_gaussians, write_gaussians
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.util.errors import UserError
 
+from ..gaussians import normal_gaussians
+
 REFERENCE = Path(__file__).parents[2].parent / "shared/splats/reference_layout_sh3.ply"
-
-
-def random_gaussians(n: int, degree: int, seed: int = 0) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    rest = SH_REST_COUNTS[degree]
-    return Gaussians(
-        normal(n, 3), normal(n, 3), normal(n, 4), normal(n), normal(n, 1, 3), normal(n, rest, 3)
-    )
 
 
 def assert_same(a: Gaussians, b: Gaussians) -> None:
@@ -43,14 +33,14 @@ def property_names(degree: int) -> list[str]:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 257, 20_000])
 def test_round_trip_is_bit_identical(tmp_path, degree, n):
-    gaussians = random_gaussians(n, degree)
+    gaussians = normal_gaussians(n, degree)
     write_gaussians(tmp_path / "scene.ply", gaussians)
     assert_same(gaussians, read_gaussians(tmp_path / "scene.ply"))
     assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]  # no temporary file remains
 
 
 def test_layout_is_the_62_properties_in_order(tmp_path):
-    gaussians = random_gaussians(2, 3)
+    gaussians = normal_gaussians(2, 3)
     write_gaussians(tmp_path / "scene.ply", gaussians)
     header, data = (tmp_path / "scene.ply").read_bytes().split(b"end_header\n")
     lines = header.decode().splitlines()
@@ -166,13 +156,13 @@ DIALECTS = {
 @pytest.mark.parametrize("name", DIALECTS)
 @pytest.mark.parametrize("degree", [0, 2, 3])
 def test_dialects_read_the_same(tmp_path, name, degree):
-    gaussians = random_gaussians(11, degree)
+    gaussians = normal_gaussians(11, degree)
     (tmp_path / "scene.ply").write_bytes(dialect(gaussians, **DIALECTS[name]))
     assert_same(gaussians, read_gaussians(tmp_path / "scene.ply"))
 
 
 def test_normals_are_optional_and_nan_is_preserved(tmp_path):
-    gaussians = random_gaussians(3, 0)
+    gaussians = normal_gaussians(3, 0)
     gaussians.means[1, 2] = float("nan")
     gaussians.log_scales[2, 0] = float("inf")
     data = dialect(gaussians, format="ascii").replace(
@@ -196,7 +186,7 @@ def one_line(path: Path) -> str:
 
 @pytest.mark.parametrize("format", ["binary_little_endian", "binary_big_endian", "ascii"])
 def test_every_truncation_is_one_line(tmp_path, format):
-    data = dialect(random_gaussians(3, 1), format=format)
+    data = dialect(normal_gaussians(3, 1), format=format)
     path = tmp_path / "scene.ply"
     # An ASCII file without its last line break, or without the last digits, still has all rows.
     end = len(data.rstrip().rsplit(b" ", 1)[0]) if format == "ascii" else len(data) - 1
@@ -212,7 +202,7 @@ def test_every_truncation_is_one_line(tmp_path, format):
 )
 @pytest.mark.parametrize("format", ["binary_little_endian", "ascii"])
 def test_counts_beyond_the_file_allocate_nothing(tmp_path, count, format):
-    data = dialect(random_gaussians(3, 0), format=format)
+    data = dialect(normal_gaussians(3, 0), format=format)
     path = tmp_path / "scene.ply"
     path.write_bytes(data.replace(b"element vertex 3", f"element vertex {count}".encode()))
     one_line(path)
@@ -238,7 +228,7 @@ def test_counts_beyond_the_file_allocate_nothing(tmp_path, count, format):
     ],
 )
 def test_invalid_headers_are_reported(tmp_path, change, expected):
-    data = dialect(random_gaussians(3, 1))
+    data = dialect(normal_gaussians(3, 1))
     assert change[0] in data
     path = tmp_path / "scene.ply"
     path.write_bytes(data.replace(*change))
@@ -247,7 +237,7 @@ def test_invalid_headers_are_reported(tmp_path, change, expected):
 
 def test_an_error_names_at_most_four_missing_properties(tmp_path):
     path = tmp_path / "scene.ply"
-    data = dialect(random_gaussians(3, 1)).replace(b"float rot_", b"float turn_")
+    data = dialect(normal_gaussians(3, 1)).replace(b"float rot_", b"float turn_")
     path.write_bytes(data)
     assert one_line(path).endswith("missing properties: rot_0, rot_1, rot_2, rot_3")
     path.write_bytes(data.replace(b"float opacity", b"float alpha"))
@@ -256,7 +246,7 @@ def test_an_error_names_at_most_four_missing_properties(tmp_path):
 
 @pytest.mark.parametrize("row", [b"0.0 nonsense", b"0.0", b"", b"\xff\xfe"])
 def test_ascii_rows_that_are_not_numbers(tmp_path, row):
-    lines = dialect(random_gaussians(4, 0), format="ascii").split(b"\n")
+    lines = dialect(normal_gaussians(4, 0), format="ascii").split(b"\n")
     lines[-3] = row.ljust(200)
     path = tmp_path / "scene.ply"
     path.write_bytes(b"\n".join(lines))
@@ -274,10 +264,10 @@ def test_a_missing_file_and_a_folder(tmp_path):
 
 def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "scene.ply"
-    write_gaussians(path, random_gaussians(5, 1))
+    write_gaussians(path, normal_gaussians(5, 1))
     old = path.read_bytes()
     monkeypatch.setattr(ply, "_WRITE_ROWS", 0)  # makes the writer raise after the header
     with pytest.raises(ValueError, match="range"):
-        write_gaussians(path, random_gaussians(9, 1))
+        write_gaussians(path, normal_gaussians(9, 1))
     assert path.read_bytes() == old
     assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]

@@ -55,7 +55,7 @@ from snowsplat.pipeline.run.training_files import write_beginning, write_scene
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera_json import read_cameras, write_cameras
-from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.sfm import make_dataset
 from snowsplat.sfm.ingest.content.sharpness import BLACK
 from snowsplat.sfm.ingest.inputs import Gathered
@@ -75,6 +75,7 @@ from snowsplat.util.stages import Stages
 from ..data.photos import colour_profiles
 from ..data.readers import exports
 from ..formats.test_ksplat import ksplat, section
+from ..gaussians import normal_gaussians
 from ..sfm.pictures import exif, pan, photo, write_video
 from ..usd import USD
 from .limits import address_limit
@@ -155,9 +156,7 @@ def _export(file: str, make: Callable[[Path], object], json: bool = False) -> Re
 
 
 def make_scene(n: int, degree: int) -> Gaussians:
-    generator = torch.Generator().manual_seed(n + degree)
-    shapes = ((n, 3), (n, 3), (n, 4), (n,), (n, 1, 3), (n, SH_REST_COUNTS[degree], 3))
-    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
+    return normal_gaussians(n, degree, n + degree)
 
 
 def _scene(file: str) -> Reader:

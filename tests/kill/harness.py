@@ -51,6 +51,7 @@ from snowsplat.training.core import checkpoint
 from snowsplat.util.ply import open_table
 from snowsplat.util.run_lock import LOCK
 
+from ..gaussians import normal_gaussians
 from .watched_command import STUDIO
 
 _MOST_DEFECTS = 20
@@ -300,19 +301,11 @@ def digest(path: Path) -> str:
 
 
 def some_gaussians(count: int, seed: int) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    return Gaussians(
-        means=normal(count, 3),
-        log_scales=normal(count, 3) - 4.0,
-        quats=torch.nn.functional.normalize(normal(count, 4), dim=1),
-        opacity_logits=normal(count),
-        sh_dc=normal(count, 1, 3),
-        sh_rest=0.1 * normal(count, 15, 3),
-    )
+    found = normal_gaussians(count, 3, seed)
+    found.log_scales -= 4.0
+    found.quats = found.rotations
+    found.sh_rest *= 0.1
+    return found
 
 
 @dataclass

@@ -12,21 +12,15 @@ from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.scene.render import render
 
+from ..gaussians import normal_gaussians
+
 
 def random_gaussians(n: int, degree: int, seed: int = 0, dtype=torch.float64) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=dtype)
-
-    return Gaussians(
-        means=0.5 * normal(n, 3),
-        log_scales=0.4 * normal(n, 3) - 2.0,
-        quats=normal(n, 4),
-        opacity_logits=normal(n),
-        sh_dc=normal(n, 1, 3),
-        sh_rest=0.3 * normal(n, SH_REST_COUNTS[degree], 3),
-    )
+    found = normal_gaussians(n, degree, seed, dtype)
+    found.means *= 0.5
+    found.log_scales.mul_(0.4).sub_(2.0)
+    found.sh_rest *= 0.3
+    return found
 
 
 def random_similarity(seed: int) -> Similarity:

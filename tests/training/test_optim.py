@@ -16,11 +16,11 @@ from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.step.optim import Adam
 from snowsplat.training.step.view_gradient import ViewGradient
 
+from ..gaussians import normal_gaussians
 
-def some_gaussians(n: int = 5, rest: int = 3) -> Gaussians:
-    generator = torch.Generator().manual_seed(n)
-    shapes = [(n, 3), (n, 3), (n, 4), (n,), (n, 1, 3), (n, rest, 3)]
-    return Gaussians(*(torch.randn(shape, generator=generator) for shape in shapes))
+
+def some_gaussians(n: int = 5, degree: int = 1) -> Gaussians:
+    return normal_gaussians(n, degree, seed=n)
 
 
 def one_step(adam: Adam, gaussians: Gaussians, step: int, regulariser: float) -> None:

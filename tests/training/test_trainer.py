@@ -31,6 +31,8 @@ from snowsplat.training.settings.starts import STARTS
 from snowsplat.training.step.losses import view_loss
 from snowsplat.util.errors import UserError
 
+from ..gaussians import assert_identical
+
 WIDTH, HEIGHT, COUNT = 24, 20, 40
 
 
@@ -114,12 +116,6 @@ def trained(dataset: Dataset, config: TrainConfig) -> Gaussians:
     trainer = Trainer(dataset, config)
     trainer.run()
     return trainer.gaussians
-
-
-def assert_identical(a: Gaussians, b: Gaussians) -> None:
-    assert a.antialiased == b.antialiased
-    for name, parameter in a.parameters().items():
-        assert torch.equal(parameter, b.parameters()[name]), name
 
 
 @pytest.mark.slow

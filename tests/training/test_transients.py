@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat import Dataset, Gaussians, TrainConfig, Trainer, load_dataset, recipe
+from snowsplat import Dataset, TrainConfig, Trainer, load_dataset, recipe
 from snowsplat.data.photos.decode import LoadedImage, load_image
 from snowsplat.evaluation.metrics import Rendering
 from snowsplat.scene.camera import Camera
@@ -30,6 +30,8 @@ from snowsplat.training.parts.view_residuals import CELL, CellMap, Witnesses, ce
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.util.errors import UserError
+
+from ..gaussians import assert_identical
 
 COUNT, WIDTH, HEIGHT = 36, 128, 96
 #: The photos with something in front of the camera, and where: left, upper, right, lower edge.
@@ -85,11 +87,6 @@ def trained(busy) -> Trainer:
 def early(busy) -> Trainer:
     """After all moments at which photos are compared."""
     return run(busy, CONFIG, EARLY)
-
-
-def assert_identical(a: Gaussians, b: Gaussians) -> None:
-    for name, parameter in a.parameters().items():
-        assert torch.equal(parameter, b.parameters()[name]), name
 
 
 # The rule

@@ -9,7 +9,6 @@ import torch
 
 from snowsplat.data import load_dataset
 from snowsplat.data.dataset import Dataset
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.trainer import Trainer
@@ -17,6 +16,8 @@ from snowsplat.training.parts.unexplained import Unexplained, explanation_of, st
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import UserError
+
+from ..gaussians import assert_identical
 
 COUNT = 24
 WRONG = 7
@@ -171,11 +172,6 @@ def run(dataset: Dataset, config: TrainConfig) -> Trainer:
 @pytest.fixture(scope="module")
 def uninterrupted(wrong) -> Trainer:
     return run(wrong, CONFIG)
-
-
-def assert_identical(a: Gaussians, b: Gaussians) -> None:
-    for name, parameter in a.parameters().items():
-        assert torch.equal(parameter, b.parameters()[name]), name
 
 
 @pytest.mark.slow

@@ -49,6 +49,19 @@ def stored(view: View) -> torch.Tensor:
     return torch.from_numpy(np.array(Image.open(view.image.path)))
 
 
+@pytest.fixture
+def decoded(monkeypatch) -> list[tuple[str, int]]:
+    """The name of each photo that is decoded, and for how many views, in this order."""
+    decoded = []
+
+    def counting(sources, background=None):
+        decoded.append((sources[0][0].path.name, len(sources)))
+        return load_views(sources, background)
+
+    monkeypatch.setattr("snowsplat.data.photos.image_loader.load_views", counting)
+    return decoded
+
+
 def wait_until_idle(loader: ImageLoader) -> None:
     """Wait until no thread decodes an image."""
     for _ in range(1000):
@@ -191,16 +204,7 @@ def test_a_budget_for_two_images_returns_the_same_pixels(views):
                 assert loader.cached_bytes <= 2 * one
 
 
-def test_images_within_the_budget_are_decoded_once(views, monkeypatch):
-    decoded = []
-    lock = threading.Lock()
-
-    def counting(sources, background=None):
-        with lock:
-            decoded.append(sources[0][0].path.name)
-        return load_views(sources, background)
-
-    monkeypatch.setattr("snowsplat.data.photos.image_loader.load_views", counting)
+def test_images_within_the_budget_are_decoded_once(views, decoded):
     with ImageLoader(views) as loader:
         for _ in range(3):
             loader.prefetch(reversed(views))
@@ -209,11 +213,11 @@ def test_images_within_the_budget_are_decoded_once(views, monkeypatch):
         for view in views:  # smaller versions are made from the cached images
             loader.get(view, 2)
         assert loader.cached_bytes == 10 * 3 * (16 * 20 + 8 * 10)
-    assert sorted(decoded) == [f"{i}.png" for i in range(10)]
+    assert sorted(decoded) == [(f"{i}.png", 1) for i in range(10)]
 
 
 @pytest.mark.parametrize("fits", [True, False])
-def test_a_photo_of_several_views_is_decoded_for_those_that_stay(tmp_path, monkeypatch, fits):
+def test_a_photo_of_several_views_is_decoded_for_those_that_stay(tmp_path, decoded, fits):
     pixels = np.random.default_rng(0).integers(0, 256, (60, 60, 3)).astype(np.uint8)
     photo = make_view(tmp_path / "a.png", pixels)
     mask = ImageSource(tmp_path / "mask.png", 60, 60)
@@ -223,13 +227,6 @@ def test_a_photo_of_several_views_is_decoded_for_those_that_stay(tmp_path, monke
         size = {"width": part.width, "height": part.height, "view": part}
         shown = dataclasses.replace(photo.image, **size), dataclasses.replace(mask, **size)
         views.append(View(part.name, photo.camera, *shown))
-    decoded = []
-
-    def counting(sources, background=None):
-        decoded.append(len(sources))
-        return load_views(sources, background)
-
-    monkeypatch.setattr("snowsplat.data.photos.image_loader.load_views", counting)
     one = 5 * views[0].image.width * views[0].image.height
     threads, budget = (3, None) if fits else (1, 4 * one)  # two images are decoded ahead
     with ImageLoader(views, threads=threads, budget_bytes=budget) as loader:
@@ -241,9 +238,9 @@ def test_a_photo_of_several_views_is_decoded_for_those_that_stay(tmp_path, monke
                 assert torch.equal(image.mask, load_mask(view.mask))
     assert len(views) > 2
     if fits:
-        assert decoded == [len(views)]
+        assert decoded == [("a.png", len(views))]
     else:
-        assert 1 < max(decoded) <= 3
+        assert 1 < max(count for _, count in decoded) <= 3
         assert len(decoded) < 2 * len(views)
 
 
@@ -258,15 +255,8 @@ def test_prefetching_stays_within_half_of_the_budget(views):
             assert torch.equal(loader.get(view).rgb, stored(view))
 
 
-def test_an_image_decoded_ahead_makes_room_for_the_next_when_it_is_requested(views, monkeypatch):
+def test_an_image_decoded_ahead_makes_room_for_the_next_when_it_is_requested(views, decoded):
     """The request for a view outside of the order changes nothing."""
-    decoded = []
-
-    def counting(sources, background=None):
-        decoded.append(sources[0][0].path.name)
-        return load_views(sources, background)
-
-    monkeypatch.setattr("snowsplat.data.photos.image_loader.load_views", counting)
     one = 4 * 16 * 20
     with ImageLoader(views, budget_bytes=2 * one) as loader:
         loader.prefetch(views[:3])
@@ -274,7 +264,7 @@ def test_an_image_decoded_ahead_makes_room_for_the_next_when_it_is_requested(vie
         loader.get(views[9])
         loader.get(views[0])
         wait_until_idle(loader)
-    assert decoded == ["0.png", "9.png", "1.png"]
+    assert decoded == [("0.png", 1), ("9.png", 1), ("1.png", 1)]
 
 
 def test_images_that_are_ready_at_once_are_decoded_once(views, monkeypatch):

@@ -59,6 +59,15 @@ def in_camera(name: str) -> np.ndarray:
     return rotation @ POINTS.T + translation[:, None]
 
 
+def brown(x, y, k, p1, p2):
+    """Positions with distortion: radial by r², r⁴, …, and tangential by p1 along x, p2 along y."""
+    r2 = x * x + y * y
+    radial = 1 + sum(value * r2**n for n, value in enumerate(k, 1))
+    u = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    v = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    return u, v
+
+
 def points(folder: Path, xyz=POINTS, name="points.ply") -> None:
     """Write a point cloud."""
     write_points(folder / name, xyz, COLORS)
@@ -87,10 +96,7 @@ def metashape(folder: Path, kind="frame", k=(0.03, -0.02, 0.01, 0.0), b1=0.7, b2
         if kind == "fisheye":
             r0 = np.hypot(x, y)
             x, y = x * np.arctan(r0) / r0, y * np.arctan(r0) / r0
-        r = np.hypot(x, y)
-        radial = 1 + k[0] * r**2 + k[1] * r**4 + k[2] * r**6 + k[3] * r**8
-        u = x * radial + p1 * (r**2 + 2 * x**2) + 2 * p2 * x * y
-        v = y * radial + p2 * (r**2 + 2 * y**2) + 2 * p1 * x * y
+        u, v = brown(x, y, k, p1, p2)
         expected[name] = np.column_stack(
             [WIDTH / 2 + cx + u * f + u * b1 + v * b2, HEIGHT / 2 + cy + v * f]
         )
@@ -140,11 +146,7 @@ def realityscan(folder: Path, newer=False):
         angles = [math.degrees(a) for a in (heading, pitch, roll)]
         rows.append(",".join(map(str, (name, x, y, alt, *angles, f35, px, py, *k, 0, t1, t2))))
         a, b, z = in_camera(name)
-        a, b = a / z, b / z
-        r2 = a * a + b * b
-        radial = 1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3
-        u = a * radial + t1 * (r2 + 2 * a * a) + 2 * t2 * a * b
-        v = b * radial + t2 * (r2 + 2 * b * b) + 2 * t1 * a * b
+        u, v = brown(a / z, b / z, k, t1, t2)
         expected[name] = np.column_stack(
             [
                 (f35 / 36 * u + px) * unit + WIDTH / 2,
@@ -248,10 +250,8 @@ def openmvg(folder: Path, kind="pinhole_brown_t2"):
             d = a + sum(c * a**n for c, n in zip(k[name], (3, 5, 7, 9), strict=True))
             u, v = x * d / r, y * d / r
         else:
-            k1, k2, k3, t1, t2 = k[name]
-            radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
-            u = x * radial + t2 * (r * r + 2 * x * x) + 2 * t1 * x * y
-            v = y * radial + t1 * (r * r + 2 * y * y) + 2 * t2 * x * y
+            *radial, t1, t2 = k[name]
+            u, v = brown(x, y, radial, t2, t1)
         # The centre of the first pixel of OpenMVG is at (0, 0).
         expected[photo] = np.column_stack([f * u + px + 0.5, f * v + py + 0.5])
     wrapper = {"id": 2, "data": {**base, name: k[name]}}
@@ -286,15 +286,11 @@ def opensfm(folder: Path, kind="brown"):
         shots[name]["camera"] = "v2 phone"
         x, y, z = in_camera(name)
         x, y = x / z, y / z
-        r2 = x * x + y * y
-        p1, p2 = lens.get("p1", 0.0), lens.get("p2", 0.0)
         if kind == "fisheye":
-            theta = np.arctan(np.sqrt(r2))
-            radial = theta * (1 + theta**2 * (lens["k1"] + theta**2 * lens["k2"])) / np.sqrt(r2)
-        else:
-            radial = 1 + r2 * (lens["k1"] + r2 * (lens["k2"] + r2 * lens.get("k3", 0.0)))
-        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        v = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+            r = np.hypot(x, y)
+            x, y = x * np.arctan(r) / r, y * np.arctan(r) / r
+        k1, k2, k3, p1, p2 = (lens.get(key, 0.0) for key in ("k1", "k2", "k3", "p1", "p2"))
+        u, v = brown(x, y, (k1, k2, k3), p2, p1)
         u = lens.get("focal_x", lens.get("focal")) * u + lens.get("c_x", 0.0)
         v = lens.get("focal_y", lens.get("focal")) * v + lens.get("c_y", 0.0)
         # OpenSfM: the pixel with the whole number p is at ((p + 0.5) - size / 2) / larger side.
@@ -334,11 +330,10 @@ def alicevision(folder: Path, newer=True):
         poses.append({"poseId": str(number), "pose": {"transform": transform, "locked": "0"}})
         x, y, z = in_camera(name)
         x, y = x / z, y / z
-        r2 = x * x + y * y
-        radial = 1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3
+        u, v = brown(x, y, k, 0.0, 0.0)
         # The centre of the first pixel of AliceVision is at (0, 0).
         expected[name] = np.column_stack(
-            [fx * x * radial + WIDTH / 2 + ox + 0.5, fx * y * radial + HEIGHT / 2 + oy + 0.5]
+            [fx * u + WIDTH / 2 + ox + 0.5, fx * v + HEIGHT / 2 + oy + 0.5]
         )
     version = ["1", "2", "6" if newer else "0"]
     scene = {"version": version, "views": views, "intrinsics": [camera], "poses": poses}
@@ -458,12 +453,7 @@ def matrices(folder: Path, layout: str):
         x, y = x / z, y / z
         if layout == "TUM":
             k1, k2, p1, p2, k3 = 0.03, -0.02, 0.002, -0.003, 0.01
-            r2 = x * x + y * y
-            radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-            x, y = (
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            )
+            x, y = brown(x, y, (k1, k2, k3), p2, p1)
         expected[Path(name).name] = np.column_stack([fx * x + cx, fy * y + cy])
     return expected
 
@@ -515,10 +505,7 @@ def realitycapture(folder: Path):
         )
         x, y, z = in_camera(name)
         x, y = x / z, y / z
-        r2 = x * x + y * y
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        u = x * radial + 2 * t2 * x * y + t1 * (r2 + 2 * x * x)
-        v = y * radial + t2 * (r2 + 2 * y * y) + 2 * t1 * x * y
+        u, v = brown(x, y, (k1, k2, k3), t1, t2)
         f = focal / 36 * unit
         expected[name] = np.column_stack(
             [f * u + px * unit + WIDTH / 2, f * v + py * unit + HEIGHT / 2]
