@@ -129,6 +129,22 @@ def test_the_explained_share_does_not_depend_on_exposure_and_contrast():
     assert compare(photo, torch.full_like(photo, 0.5)).explained == 0.0  # no contrast
 
 
+def test_contours_of_a_hazy_image_and_of_a_shifted_one():
+    """A haze changes brightness over large areas; a shift doubles contours."""
+    y, x = torch.meshgrid(torch.arange(200.0), torch.arange(300.0), indexing="ij")
+    photo = 0.5 + 0.1 * torch.sign(torch.sin(x / 5) * torch.sin(y / 5))[:, :, None].expand(
+        -1, -1, 3
+    )
+    haze = photo + 0.12 * torch.sin(x / 60)[:, :, None]
+    hazy, shifted = compare(haze, photo), compare(photo.roll(8, 1), photo)
+    assert hazy.contours > 0.75 > 0.6 > hazy.explained
+    assert shifted.contours < 0.3
+    mask = x < 150
+    wrong = torch.where(mask[:, :, None], photo, 1.0 - photo)
+    assert compare(wrong, photo, mask).contours == pytest.approx(1.0)
+    assert compare(photo, torch.full_like(photo, 0.5)).contours == 0.0  # none
+
+
 def test_means_and_json():
     evaluation = Evaluation(
         [ViewMetrics("a", 20.0, 0.5, 21.0, 0.25), ViewMetrics("b", 30.0, 0.75, 33.0, 0.5, 0.9)]
@@ -142,6 +158,7 @@ def test_means_and_json():
         "psnr_aligned": 33.0,
         "lpips": 0.5,
         "explained": 0.9,
+        "contours": None,
         "size": None,
     }
     assert values["psnr_aligned"] == 27.0

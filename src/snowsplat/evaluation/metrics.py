@@ -24,6 +24,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
 from snowsplat import ops
 from snowsplat.data.dataset import View
@@ -39,6 +40,10 @@ from snowsplat.util.names import first_names
 # Number of photos for which there is memory. Each photo is used once, so the memory only serves to
 # decode ahead.
 _PHOTOS_AHEAD = 6
+# Pixels: the longest side of the copies whose contours are compared, and the side of the square
+# around a pixel with which it is compared. It is 3% of the photo: a camera that is a degree off
+# moves contours by half of that.
+_CONTOUR_SIDE, _AROUND = 256, 7
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,9 @@ class ViewMetrics:
     # Share of the variance of the photo that the colour-aligned image explains, at most 1. Unlike a
     # PSNR, it does not depend on the contrast of the photo. None: not measured.
     explained: float | None = None
+    # The same share of the contours: of what differs from its surroundings in a copy of the photo
+    # with a longest side of 256 pixels. None: not measured.
+    contours: float | None = None
     # Width and height of the compared images, in pixels; None: unknown.
     size: tuple[int, int] | None = None
 
@@ -199,6 +207,7 @@ def compare(
         lpips=distance,
         size=(image.shape[1], image.shape[0]),
         explained=_explained(aligned, target, mask),
+        contours=_contours(aligned, target, mask),
     )
 
 
@@ -208,6 +217,21 @@ def _explained(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
     x, y = (x.flatten(0, 1), y.flatten(0, 1)) if mask is None else (x[mask], y[mask])
     variance = float((y - y.mean(0)).square().sum()) if len(y) else 0.0
     return 1.0 - float((x - y).square().sum()) / variance if variance > 0.0 else 0.0
+
+
+def _contours(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    """`ViewMetrics.contours`; 0 for a photo without any."""
+    if mask is not None:
+        image, target = (each * mask[:, :, None] for each in (image, target))
+    pair = torch.stack([image, target]).permute(0, 3, 1, 2)
+    factor = _CONTOUR_SIDE / max(pair.shape[-2:])
+    if factor < 1.0:
+        size = [max(1, round(side * factor)) for side in pair.shape[-2:]]
+        pair = interpolate(pair, size, mode="area")
+    around = avg_pool2d(pair, _AROUND, 1, _AROUND // 2, count_include_pad=False)
+    x, y = (pair - around).to(torch.float64)
+    total = float(y.square().sum())
+    return 1.0 - float((x - y).square().sum()) / total if total > 0.0 else 0.0
 
 
 @torch.no_grad()

@@ -22,13 +22,13 @@ def dataset(tmp_path_factory):
     return load_dataset(folder, hold_out=4)
 
 
-def evaluation(*explained: float, ssim: float = 0.9) -> Evaluation:
+def evaluation(*explained: float, ssim: float = 0.9, contours: float = 0.5) -> Evaluation:
     """The PSNR is that of photos with a variance of 0.1."""
     names = [f"view_{4 * i:02d}.png" for i in range(len(explained))]
     values = [-10 * math.log10(max(0.1 * (1 - share), 1e-9)) for share in explained]
     return Evaluation(
         [
-            ViewMetrics(name, psnr, ssim, psnr, None, share)
+            ViewMetrics(name, psnr, ssim, psnr, None, share, contours)
             for name, psnr, share in zip(names, values, explained, strict=True)
         ]
     )
@@ -49,6 +49,7 @@ def told(verdict: Verdict) -> str:
         (evaluation(0.85, 0.86, 0.87), SHARP, "usable", "the error is 2.6 times"),
         (evaluation(0.7, 0.7, 0.7), SHARP, "poor", "the error is 3.9 times"),
         (evaluation(0.6, 0.6, 0.6), evaluation(0.8), "poor", "reproduces only 60%"),
+        (evaluation(0.6, 0.6, 0.6, contours=0.8), SHARP, "usable", "but 80% of that of contours"),
         (evaluation(-0.2), evaluation(0.3), "poor", "0.3 of"),
         (evaluation(0.95, 0.96, 0.97, ssim=0.6), SHARP, "usable", "blurred in held-out photos"),
         (evaluation(1.0), evaluation(1.0), "good", "reproduces 100%"),

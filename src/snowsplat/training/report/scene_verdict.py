@@ -23,6 +23,10 @@ from snowsplat.util.names import first_names
 #: The explained share of the typical held-out photo. At 0.9, the error is a third of the contrast
 #: of the photo (1 / √10); at 0.75, a half: contours are doubled or missing.
 _GOOD, _USABLE = 0.9, 0.75
+#: If this share of the contours of the typical held-out photo is reproduced, none are doubled or
+#: missing: only smooth areas, such as a white wall, differ. In 13 public captures with right poses,
+#: it is 0.54 to 0.85; if each camera is turned by a degree, 0.3 and less.
+_CONTOURS = 0.6
 #: A single photo below this share shows something else than the scene.
 _WRONG = 0.5
 #: dB. Smaller errors, of 4 grey levels, are not visible: a white ceiling has less contrast.
@@ -125,6 +129,14 @@ def _new_views(held_out: Evaluation, trained_on: Evaluation, dataset: Dataset) -
         **values,
     )
     grade: Grade = "poor" if share < _USABLE else "usable"
+    contours = float(np.median([view.contours or 0.0 for view in held_out.views]))
+    if grade == "poor" and contours >= _CONTOURS:
+        grade = "usable"
+        text = message(
+            "{text}, but {contours:.0%} of that of contours: smooth areas have a wrong brightness",
+            text=text,
+            contours=contours,
+        )
     factor = 10.0 ** ((_psnr(trained_on) - _psnr(held_out)) / 20.0)
     if factor < _LACKS_PHOTOS:
         return [Reason(grade, text)]
