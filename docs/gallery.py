@@ -3,9 +3,9 @@
     python docs/gallery.py                 # all
     python docs/gallery.py still-life      # one of them
 
-The scenes are procedural: `snowsplat.synthetic` and `tests/scenes` have no file of anybody else.
-A scene becomes a page of one file in build/gallery, which `make docs` copies into the site if it is
-there, and a picture in docs/pictures. Nothing is made that is there already.
+The scenes are procedural: no file of anybody else is in them. A scene becomes a page of
+one file in build/gallery, which `make docs` copies into the site if it is there, and a picture in
+docs/pictures. Nothing is made that is there already.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import torch
+from PIL import Image
+
 import snowsplat
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.render import render, to_8bit
+from snowsplat.synthetic.photographer import write_synthetic_photos
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-import torch  # noqa: E402
-from PIL import Image  # noqa: E402
-from tests.scenes.street_dataset import write_street_dataset  # noqa: E402
-
-from snowsplat.synthetic.photographer import write_synthetic_photos  # noqa: E402
+from street_dataset import write_street_dataset  # noqa: E402
 
 PAGES, WORK = ROOT / "build" / "gallery", ROOT / "build" / "gallery-work"
 PICTURE_SIZE = 600, 400
@@ -40,10 +40,9 @@ def room(seed: int) -> Callable[[Path], object]:
 SCENES: dict[str, tuple[Callable[[Path], object], str]] = {
     "still-life": (room(0), "draft"),
     "red-room": (room(3), "draft"),
-    "study": (room(5), "draft"),
     "street": (lambda folder: write_street_dataset(folder, 120, 480, 320), "draft"),
 }
-#: The scene that is put into a snow globe, the fifth page.
+#: The scene that is put into a snow globe, another page.
 GLOBE = "still-life"
 
 

@@ -162,8 +162,8 @@ const TEXTS = {
         "将 ZIP 解压到网站主机，把其地址填入此行，再将此行放进网页：",
     ],
     look: [
-        "Whoever has this link can look at the scene as long as the studio runs, but change nothing:",
-        "拥有此链接的人在工作室运行期间可以查看场景，但不能更改：",
+        "These links only show the scene, as long as the studio runs. On this computer:",
+        "这些链接只能查看场景，在工作室运行期间有效。在本机上：",
     ],
     phone: ["Open it on a phone in the same network", "在同一网络的手机上打开"],
     phone_how: [
