@@ -285,7 +285,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("dataset", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("nano.ply"))
-    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--width", type=int, default=326, help="of the photos, in pixels")
     parser.add_argument("--limit", type=int, default=40_000, help="of Gaussians")
     options = parser.parse_args()

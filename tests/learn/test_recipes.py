@@ -132,7 +132,7 @@ STATEMENTS: list[tuple[str, str, Check]] = [
 NO_SETTING = (
     "initialisation.md",
     "`training/settings/recipes.py` contains all values",
-    "with the same number of steps of the recipe `classic`",
+    "The kernels with the recipe `classic` reach",
 )
 
 
