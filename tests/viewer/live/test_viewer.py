@@ -3,7 +3,7 @@
 import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.data import load_dataset
+from snowsplat.data import Dataset, load_dataset
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
@@ -27,10 +27,26 @@ from ..clients import Visitor, frame, upgrade, view
 pytestmark = pytest.mark.slow
 
 
-def test_a_newer_scene_replaces_the_one_shown(tmp_path):
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Dataset:
+    folder = tmp_path_factory.mktemp("viewer")
+    return load_dataset(write_toy_dataset(folder, "colmap-bin", 3, 48, 36, n_points=50))
+
+
+@pytest.fixture
+def gaussians(dataset) -> Gaussians:
+    return Gaussians.from_points(dataset.points)
+
+
+@pytest.fixture
+def viewer(dataset) -> Iterator[NetworkViewer]:
+    viewer = NetworkViewer(dataset, label="a <scene>")
+    yield viewer
+    viewer.close()
+
+
+def test_a_newer_scene_replaces_the_one_shown(viewer, gaussians):
     """`snowsplat watch` shows each new checkpoint, which may have another number of Gaussians."""
-    dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
-    gaussians = Gaussians.from_points(dataset.points)
     few = gaussians.select(torch.arange(30))
     saved, shown = [Scene(few, 1, [Message("30")])], []
     ended = threading.Event()
@@ -45,7 +61,6 @@ def test_a_newer_scene_replaces_the_one_shown(tmp_path):
         with suppress(KeyboardInterrupt):
             viewer.show_newest(newest)
 
-    viewer = NetworkViewer(dataset)
     thread = threading.Thread(target=show)
     thread.start()
     try:
@@ -61,15 +76,11 @@ def test_a_newer_scene_replaces_the_one_shown(tmp_path):
     finally:
         ended.set()
         thread.join(timeout=20.0)
-        viewer.close()
     assert not thread.is_alive()
 
 
-def test_a_browser_that_receives_slowly_gets_the_newest_images(tmp_path):
+def test_a_browser_that_receives_slowly_gets_the_newest_images(viewer, gaussians):
     """An image that the browser does not acknowledge has not arrived, and only a few are sent."""
-    dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
-    gaussians = Gaussians.from_points(dataset.points)
-    viewer = NetworkViewer(dataset)
 
     def images(move: Callable[[float], None], moves: int) -> int:
         """How many images are rendered while the camera moves."""
@@ -82,32 +93,28 @@ def test_a_browser_that_receives_slowly_gets_the_newest_images(tmp_path):
                 time.sleep(0.005)
         return rendered
 
-    try:
-        with upgrade(viewer.url) as silent:
-            assert images(lambda x: silent.sendall(frame(view(position=[x, 0.0, -3.0]))), 12) == 3
-            (seen,) = viewer.session._visitors.values()
-            assert seen.on_the_way == 3
-        wait_until(lambda: not viewer.session.visitors)
-        with Visitor(viewer.url) as visitor:
+    with upgrade(viewer.url) as silent:
+        assert images(lambda x: silent.sendall(frame(view(position=[x, 0.0, -3.0]))), 12) == 3
+        (seen,) = viewer.session._visitors.values()
+        assert seen.on_the_way == 3
+    wait_until(lambda: not viewer.session.visitors)
+    with Visitor(viewer.url) as visitor:
 
-            def move(x: float) -> None:
-                visitor.view(position=[x, 0.0, -3.0])
-                visitor.pictures(0.02)
+        def move(x: float) -> None:
+            visitor.view(position=[x, 0.0, -3.0])
+            visitor.pictures(0.02)
 
-            assert images(move, 12) >= 9
-            (seen,) = viewer.session._visitors.values()
-            visitor.pictures(0.5)
-            wait_until(lambda: seen.on_the_way == 0)
-    finally:
-        viewer.close()
+        assert images(move, 12) >= 9
+        (seen,) = viewer.session._visitors.values()
+        visitor.pictures(0.5)
+        wait_until(lambda: seen.on_the_way == 0)
 
 
-def test_the_page_does_not_depend_on_the_unit_of_the_scene(tmp_path):
-    usual = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
+def test_the_page_does_not_depend_on_the_unit_of_the_scene(dataset, tmp_path):
     images, scenes = [], []
     for factor in (1.0, 2.0**-13, 2.0**13):
-        dataset = scaled(usual, factor)
-        viewer = NetworkViewer(dataset)
+        other = scaled(dataset, factor)
+        viewer = NetworkViewer(other)
         try:
             with Visitor(viewer.url) as visitor:
                 scene = visitor.wait_for("scene")
@@ -123,9 +130,9 @@ def test_the_page_does_not_depend_on_the_unit_of_the_scene(tmp_path):
                 (tmp_path / "cameras.json").write_text(json.dumps(visitor.keys))
                 (camera,) = read_cameras(tmp_path / "cameras.json")[1]
                 assert camera.position.tolist() == [0.0, 0.0, -3.0 * factor]
-                assert camera.near == usual.train[0].camera.near * factor
+                assert camera.near == dataset.train[0].camera.near * factor
                 request = viewer.session.next_request(0, False)
-                gaussians = Gaussians.from_points(dataset.points)
+                gaussians = Gaussians.from_points(other.points)
                 images.append(viewer._draw(request, gaussians).astype(int))
         finally:
             viewer.close()
@@ -135,37 +142,28 @@ def test_the_page_does_not_depend_on_the_unit_of_the_scene(tmp_path):
         assert np.abs(image - images[0]).max() <= 1
 
 
-def test_an_image_has_the_number_of_its_view(tmp_path):
+def test_an_image_has_the_number_of_its_view(viewer, gaussians, dataset):
     """So that the page draws the cameras of the photos where they are in the image."""
-    dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
-    gaussians = Gaussians.from_points(dataset.points)
-    viewer = NetworkViewer(dataset)
-    try:
-        with Visitor(viewer.url) as visitor:
-            for number in (5, 6):
-                visitor.view(number=number, position=[0.0, 0.1 * number, -3.0])
-                wait_until(lambda: viewer.serve(gaussians, 0, training=False))
-                assert visitor.pictures(20.0, most=1) == 1
-                assert visitor.view_shown == number
-                assert max(visitor.newest.size) <= 320
-            visitor.view(number=7, photo=1)
-            wait_until(lambda: [v for v in viewer.session._visitors.values() if v.photo_view])
-            visitor.display(wipe=1.0)
-            visitor.pictures(0.3)
+    with Visitor(viewer.url) as visitor:
+        for number in (5, 6):
+            visitor.view(number=number, position=[0.0, 0.1 * number, -3.0])
             wait_until(lambda: viewer.serve(gaussians, 0, training=False))
-            visitor.pictures(0.5)
-            shown = np.asarray(visitor.newest.resize((48, 36)), np.float64)
-            photo = np.asarray(Image.open(dataset.train[1].image.path), np.float64)
-            assert np.abs(shown - photo).mean() < 12.0
-    finally:
-        viewer.close()
+            assert visitor.pictures(20.0, most=1) == 1
+            assert visitor.view_shown == number
+            assert max(visitor.newest.size) <= 320
+        visitor.view(number=7, photo=1)
+        wait_until(lambda: [v for v in viewer.session._visitors.values() if v.photo_view])
+        visitor.display(wipe=1.0)
+        visitor.pictures(0.3)
+        wait_until(lambda: viewer.serve(gaussians, 0, training=False))
+        visitor.pictures(0.5)
+        shown = np.asarray(visitor.newest.resize((48, 36)), np.float64)
+        photo = np.asarray(Image.open(dataset.train[1].image.path), np.float64)
+        assert np.abs(shown - photo).mean() < 12.0
 
 
-def test_the_page_of_a_finished_training_says_so(tmp_path):
+def test_the_page_of_a_finished_training_says_so(viewer, gaussians):
     """The result stays, without the controls of the training, and further images are served."""
-    dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
-    gaussians = Gaussians.from_points(dataset.points)
-    viewer = NetworkViewer(dataset, label="a <scene>")
     ended = threading.Event()
 
     def show() -> None:
@@ -201,4 +199,3 @@ def test_the_page_of_a_finished_training_says_so(tmp_path):
     finally:
         ended.set()
         thread.join(timeout=20.0)
-        viewer.close()
