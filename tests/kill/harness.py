@@ -54,6 +54,9 @@ from snowsplat.util.run_lock import LOCK
 from ..gaussians import normal_gaussians
 from .watched_command import STUDIO
 
+#: For more kills, and at other moments.
+TIMES = int(os.environ.get("SNOWSPLAT_KILLS", "1"))
+SEED = int(os.environ.get("SNOWSPLAT_SEED", "1"))
 _MOST_DEFECTS = 20
 _SOURCE = str(Path(snowsplat.__file__).parents[1])
 
@@ -213,9 +216,8 @@ def _is_dead(process: Path) -> bool:
 # Checks of files with final names
 
 
-def check_whole(folder: Path) -> int:
-    """Read all files; returns their number. Raises Defect if one cannot be read to its end."""
-    count = 0
+def check_whole(folder: Path) -> None:
+    """Read all files. Raises Defect if one cannot be read to its end."""
     for path in sorted(folder.rglob("*")):
         parts = path.relative_to(folder).parts
         if any(part.startswith(".") for part in parts) or not path.is_file():
@@ -226,8 +228,6 @@ def check_whole(folder: Path) -> int:
             _open(path)
         except Exception as error:
             raise Defect(f"{path.relative_to(folder)} is incomplete: {error!r}") from error
-        count += 1
-    return count
 
 
 def _open(path: Path) -> None:
@@ -329,22 +329,12 @@ class Job:
 
 
 @dataclass
-class Tally:
-    """Statistics of a job."""
-
-    kills: int = 0
-    rounds: int = 0
-    files: int = 0  # checked after kills
-    ended: int = 0  # runs that ended before the kill
-
-
-@dataclass
 class Killer:
     """Kills jobs at random times that depend on a seed."""
 
     runner: Runner
     seed: int
-    tallies: dict[str, Tally] = field(default_factory=dict)
+    kills: int = 0
     _references: dict[str, tuple[Path, Ended]] = field(default_factory=dict)
 
     def reference(self, job: Job) -> tuple[Path, Ended]:
@@ -365,8 +355,8 @@ class Killer:
         """Run rounds of the jobs in turn until this number of kills; returns the defects."""
         moments = random.Random(f"{self.seed} {number}")
         found: list[Defect] = []
-        before = sum(tally.kills for tally in self.tallies.values())
-        while sum(tally.kills for tally in self.tallies.values()) < before + kills:
+        before = self.kills
+        while self.kills < before + kills:
             try:
                 self.round(jobs[number % len(jobs)], moments.randint(1, 5), number)
             except Defect as defect:
@@ -382,7 +372,6 @@ class Killer:
         Raises:
             Defect: see `Job`; the folder is kept for inspection.
         """
-        tally = self.tallies.setdefault(job.name, Tally())
         moments = random.Random(f"{self.seed} {job.name} {number}")
         whole, undisturbed = self.reference(job)
         folder = self.runner.folder / f"killed {job.name} {number}"
@@ -398,10 +387,9 @@ class Killer:
                 if not ended.killed:
                     if ended.code != 0:
                         raise Defect(f"exit code {ended.code} after a kill\n{ended.text}")
-                    tally.ended += 1
                     break
-                tally.kills += 1
-                tally.files += check_whole(folder)
+                self.kills += 1
+                check_whole(folder)
                 job.check_killed(output, whole / job.output)
             ended = self.runner.run(job.command(output, True))
             if ended.code != 0:
@@ -414,7 +402,6 @@ class Killer:
         except Exception as error:
             runs = "; ".join(history)
             raise Defect(f"{job.name}, round {number} ({runs}): {error}") from error
-        tally.rounds += 1
         shutil.rmtree(folder)
 
 

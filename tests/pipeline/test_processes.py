@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import random
 import re
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
 from ..fork_server import popen, run
+from ..kill.harness import SEED, TIMES
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc, and the name lo")
 FLAGS = ["--iterations", "120", "--batch", "4", "--checkpoint-every", "40", "--eval", "-q"]
@@ -41,10 +44,10 @@ def scene(dataset: Path) -> bytes:
     return (out / SCENE).read_bytes()
 
 
-def children_of(process: int) -> list[int]:
-    """The two processes that train, in the order of their numbers."""
+def children_of(process: int, count: int = 2) -> list[int]:
+    """The processes that train, in the order of their numbers."""
     children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-    assert len(children) == 2
+    assert len(children) == count
     return [int(child) for child in children]
 
 
@@ -83,6 +86,23 @@ def test_a_killed_process_ends_all_and_another_number_of_processes_resumes(
     )
     assert not any(Path(f"/proc/{child}").exists() for child in children)
     assert main(["train", "-o", str(out), "--resume", "-q"]) == 0
+    assert (out / SCENE).read_bytes() == scene
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("case", range(3 * TIMES))
+def test_one_of_four_processes_is_killed_at_any_time(dataset, scene, tmp_path, case):
+    """1, 2 or 3 processes resume, or begin again if there was no checkpoint yet."""
+    chance, out = random.Random(f"{SEED} {case}"), tmp_path / "out"
+    parent = popen(*TRAIN, dataset, "-o", out, *FLAGS, "--processes", 4, forks=True)
+    time.sleep(chance.uniform(0.5, 8.0))
+    with suppress(AssertionError, OSError):  # it is just starting or ending
+        os.kill(children_of(parent.pid, 4)[chance.randrange(4)], signal.SIGKILL)
+    _, errors = parent.communicate(timeout=120)
+    assert (parent.returncode, len(errors.splitlines())) in ((0, 0), (2, 1)), errors
+    resumed = ("--resume", "--processes", chance.choice([1, 2, 3]))
+    done = run(*TRAIN, dataset, "-o", out, *FLAGS, *resumed, forks=True)
+    assert done.returncode == 0, done.stderr
     assert (out / SCENE).read_bytes() == scene
 
 
