@@ -50,6 +50,16 @@ def test_the_page_and_its_parts(studio):
     assert about["look"] == f"../{look}/scenes/a/site/index.html"
 
 
+def test_a_link_that_only_shows_a_scene_with_any_name(studio):
+    name = new(studio, title="Ein Tisch, 木 50%")
+    site = studio.library.find(name).site
+    site.mkdir()
+    (site / "a.json").write_text("{}")
+    path = quote(f"scenes/{name}/site/a.json")
+    look = studio.ask(f"about?path={quote(path)}")[1]["look"]
+    assert studio.ask(look.removeprefix(".."))[0] == 200
+
+
 def test_an_upload_and_what_became_of_it(studio):
     name = new(studio)
     assert studio.ask("scenes")[1][0]["status"] == "new"

@@ -101,6 +101,9 @@ def test_a_turn_in_the_page(studio, forked):
     with Browser(900, 600, frames=4.0) as browser:
         page = browser.open(f"{studio.server.url}scenes/tour/site/index.html", timeout=60)
         page.wait_for("!!document.querySelector('.snow-edit')", 120)
+        # Copied links only show the scene.
+        look = studio.server._guard.look("scenes/tour/site/index.html")
+        page.wait_for(f"window.sse.look?.includes('/{look}/scenes/tour/site/index.html')")
         press(page, "Film")
         press(page, "360° turn")
         assert page.evaluate("document.querySelectorAll('.snow-keys button').length") == 8

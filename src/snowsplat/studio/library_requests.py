@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import urljoin
+from urllib.parse import unquote, urljoin
 
 import segno
 from starlette.requests import Request
@@ -37,8 +37,8 @@ async def page(studio: Studio, request: Request) -> Any:
 
 async def about(studio: Studio, request: Request) -> Any:
     path = request.query_params.get("path", "")
-    # Phones may look at this scene, no more.
-    look = request.scope[LOOK](path)
+    # Phones may look at this scene, no more. The path is that of an address: "a%20b" is "a b".
+    look = request.scope[LOOK](unquote(path))
     urls = [urljoin(url, f"../{look}/{path}") for url in studio.addresses()]
     codes = [segno.make(url, error="m").svg_data_uri(scale=4, border=2) for url in urls]
     return {

@@ -59,7 +59,7 @@ export function resultPart(
                 : fact(result.aligned ? "psnr_aligned" : "psnr", `${result.psnr.toFixed(2)} dB`)),
             ...(result.seconds === null ? [] : fact("took", duration(result.seconds))),
         ),
-        scene.verdict && make("section.card", {}, make("h2", {}, say("verdict")), ...verdictOf(scene.verdict)),
+        scene.verdict && make("section.card.verdict", {}, make("h2", {}, say("verdict")), ...verdictOf(scene.verdict)),
         make(
             "section.card",
             {},

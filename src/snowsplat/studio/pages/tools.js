@@ -24,6 +24,10 @@ function addTools(/** @type {any} */ page) {
         const isOpen = page.panel.querySelector(".snow-tools:not([hidden])") !== null;
         if (isOpen || innerWidth >= NARROW) page.panel.classList.remove("snow-faded");
     });
+    const keep = (/** @type {string} */ address) => {
+        /** @type {any} */ (window).sse.look = address;
+    };
+    lookAddress().then(keep, () => {}); // without it, the link is that of the page
     const begin = async () => {
         const others = new Set(page.panel.querySelectorAll("button"));
         addFilm(page, version ?? "");
@@ -33,6 +37,13 @@ function addTools(/** @type {any} */ page) {
     };
     if (state.loaded) begin();
     else events.once("loaded:changed", begin);
+}
+
+/** The address at which this scene can only be looked at. */
+async function lookAddress() {
+    const path = [...location.pathname.split("/").slice(-4, -2), "site", "index.html"].join("/");
+    const { look } = await ask(`../../../about?path=${encodeURIComponent(path)}`);
+    return new URL(look, new URL("../../../", location.href)).href;
 }
 
 /** Film and Edit have the same place, so opening one closes the other. */

@@ -153,7 +153,9 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
         const values = String(hiding.values());
         const hidden = values === String(scene.hiding.start) ? "" : `&hide=${values}`;
         history.replaceState(null, "", `#view=${view}${hidden}`);
-        const done = await navigator.clipboard?.writeText(location.href).then(
+        // In the studio, the address of the page would give away the studio.
+        const address = (window.sse.look ?? location.href.split("#")[0]) + location.hash;
+        const done = await navigator.clipboard?.writeText(address).then(
             () => true,
             () => false,
         );
