@@ -137,14 +137,6 @@ def test_another_shake_interrupts_the_flight_home():
     assert not shaken.standing
 
 
-def test_the_same_shake_has_the_same_result():
-    first, second = snow(), snow()
-    for one in (first, second):
-        shake(one)
-        run(one, 2.0)
-    assert (first.position == second.position).all()
-
-
 def test_the_flow_keeps_its_volume_and_does_not_cross_the_glass():
     flow = physics.flow_grid(0.7).astype(float)
     cells = physics.FLOW_CELLS
