@@ -186,6 +186,23 @@ def test_a_window_shows_no_more_than_the_photos_do(scene, tmp_path):
         assert 300 / scene.camera(300, 600).fy == pytest.approx(across)
 
 
+def test_photos_of_a_room_from_its_middle():
+    """They have no subject that a window must hold: the page begins with the first one."""
+    random = torch.Generator().manual_seed(0)
+    walls = torch.nn.functional.normalize(torch.randn(3000, 3, generator=random), dim=1) * 4
+    points = Points(walls, torch.zeros(len(walls), 3, dtype=torch.uint8))
+    cameras = []
+    for turn in range(6):
+        sine, cosine = math.sin(turn), math.cos(turn)
+        rotation = [[cosine, 0.0, -sine, 0.0], [0.0, 1.0, 0.0, 0.0], [sine, 0.0, cosine, -0.1]]
+        pose = torch.tensor(rotation, dtype=torch.float64)
+        cameras.append(Camera(80, 60, 60.0, 60.0, 40.0, 30.0, pose))
+    scene = ready(Gaussians.from_points(points), cameras)
+    assert scene.first == 0
+    assert scene.stops.held == [(0.0, 0.0)] * 6
+    assert scene.camera(60, 120).fy >= scene.start.camera(60, 120).fy
+
+
 def test_what_photos_show_beside_a_photo():
     """A wall at z = 4, which photos from x = −1, 0 and 1 show; its parts are counted by angles."""
     wall = torch.cartesian_prod(torch.linspace(-9, 9, 91), torch.linspace(-9, 9, 91))

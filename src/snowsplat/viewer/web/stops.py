@@ -10,7 +10,6 @@ left to right.
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -54,7 +53,7 @@ class Stops(NamedTuple):
     # show most of what is beside the view; 1 to 3.
     seen: list[tuple[float, float]]
     # For each stop, half of the width and of the height, at a distance of 1, that hold the core of
-    # the subject, which has half of what the radius has.
+    # the subject, which has half of what the radius has; 0 if it is not ahead.
     held: list[tuple[float, float]]
 
     def view(self, stop: int) -> InitialView:
@@ -95,7 +94,7 @@ def first_stop(stops: Stops) -> int:
     shares = []
     for view, held in zip(stops.views, stops.held, strict=True):
         across, down = view.tangents()
-        shares.append(min(1.0, across / held[0], down / held[1]))
+        shares.append(min(1.0, across / held[0], down / held[1]) if held[0] else 0.0)
     return next(i for i, share in enumerate(shares) if share >= max(shares) - _AS_WELL)
 
 
@@ -114,9 +113,12 @@ def shown_at(stops: Stops, stop: int, width: int, height: int) -> Camera:
 
 
 def _held(view: InitialView, middle: Tensor, radius: float) -> tuple[float, float]:
-    """Half of the width and of the height, at a distance of 1, that hold a sphere."""
+    """Half of the width and of the height, at a distance of 1, that hold a sphere; 0 if the camera
+    is in the sphere or looks away, as in photos of a room from its middle."""
     x, y, ahead = transform_points(view.camera(2, 2).cam_from_world, middle[None])[0].tolist()
-    return tuple((abs(side) + radius) / ahead if ahead > 0 else math.inf for side in (x, y))
+    if ahead <= radius:
+        return 0.0, 0.0
+    return (abs(x) + radius) / ahead, (abs(y) + radius) / ahead
 
 
 def _look(
