@@ -43,7 +43,7 @@ TRANSLATED = (
     "learn/*.md",
 )
 #: Pages of `docs/zh/` that are not translations.
-OWN = ("index.md", "glossary.md")
+OWN = ("index.md", "glossary.md", "notebooks/exercises.md")
 _FIRST_LINE = re.compile(r"<!-- translation of (\S+) ([0-9a-f]{16}) -->\n")
 
 # Excerpts of source files (docs/excerpts.py): a translation has the same, and nothing to translate.
