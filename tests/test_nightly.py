@@ -1,12 +1,21 @@
-"""The nightly scripts fit the code: the files and texts that they name exist."""
+"""The nightly scripts fit the code: they start; the files and texts that they name exist."""
 
 import sys
 from pathlib import Path
 
 import pytest
 
+from . import fork_server
+
 NIGHTLY = Path(__file__).resolve().parent / "nightly"
 NATIVE = Path(__file__).resolve().parents[1] / "src" / "snowsplat" / "native"
+
+
+@pytest.mark.parametrize("script", sorted(path.name for path in NIGHTLY.glob("*.py")))
+def test_every_script_starts(script):
+    done = fork_server.run(NIGHTLY / script, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "usage:" in done.stdout
 
 
 @pytest.fixture

@@ -37,10 +37,11 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from browser import Browser, BrowserError, chromium
-from kill.harness import names_in
+from tests.browser import Browser, BrowserError, chromium
+from tests.kill.harness import names_in
+
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.edit import moved_film, page_frames

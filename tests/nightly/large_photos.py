@@ -5,6 +5,7 @@
 The file has a grid of two tiles, each used 96 times, so that it is written in a second.
 """
 
+import argparse
 import io
 import resource
 import struct
@@ -42,6 +43,7 @@ def heic() -> bytes:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     register_heif_opener()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.heic"
