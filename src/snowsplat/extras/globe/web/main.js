@@ -311,7 +311,7 @@ class Globe {
 const chinese = navigator.language.toLowerCase().startsWith("zh");
 if (chinese) {
     document.documentElement.lang = "zh-CN";
-    document.title = `${about.name} - 雪花球`;
+    document.title = element("title").textContent = `${about.name} - 雪花球`;
     element("view").setAttribute("aria-label", `雪花球中的场景：${about.name}`);
     element("hint").textContent = "拖动可以转动雪花球，快速拖动可以摇晃它；在手机上，也可以摇晃手机。";
     for (const [id, text, title] of [
