@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -31,18 +30,9 @@ from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import Mapper
 from snowsplat.util.messages import Message
 
-#: "plain": the incremental mapper with COLMAP's own order of registration.
-AnyMapper = Mapper | Literal["plain"]
-
 # Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
 # which the features were detected.
 _MAX_ERROR = 4.0
-
-_MAPPERS = {
-    "incremental": "incremental mapping",
-    "plain": "incremental mapping in COLMAP's order",
-    "global": "global mapping",
-}
 
 
 @dataclass(frozen=True)
@@ -65,6 +55,7 @@ class Attempt:
     """The result of an attempt."""
 
     matched: Matched
+    photos: list[Photo]  # in the groups of the attempt
     lens: Lens  # with which the attempt began
     mapping: Mapping  # for further work on the models
     models: list[pycolmap.Reconstruction]
@@ -88,10 +79,8 @@ class AttemptRunner:
     threads: int
     progress: WorkerProgress
 
-    def match(
-        self, database: Path, effort: Effort, pairing: Effort, *, reserve: bool = True
-    ) -> Matched:
-        """Detect the features of ``effort``, and match the pairs of the effort ``pairing``.
+    def match(self, database: Path, effort: Effort, *, reserve: bool = True) -> Matched:
+        """Detect features, and match pairs of photos.
         ``reserve``: whether the pairs of the reserve are matched, too."""
         fingerprint = fingerprint_of(self.dataset.photos, self.photos, effort)
         open_database(database, self.photos, Lens(self.camera_model), fingerprint)
@@ -99,7 +88,7 @@ class AttemptRunner:
         indices = range(len(self.photos))
         choice = choose_pairs(
             self.photos,
-            pairing,
+            effort,
             lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices]),
         )
         scales = [
@@ -139,13 +128,11 @@ class AttemptRunner:
             show_poses=self.progress.show_poses,
         )
 
-    def run(
-        self, how: str, matched: Matched, mapper: AnyMapper, lens: Lens, relaxed: bool = False
-    ) -> Attempt:
-        """Make an attempt. ``how`` describes it, as text for users; ``relaxed`` as in `Mapping`."""
+    def run(self, how: str, matched: Matched, mapper: Mapper, lens: Lens) -> Attempt:
+        """Make an attempt. ``how`` describes it, as text for users."""
         set_cameras(matched.database, self.photos, lens)
         mapping = self.mapping(matched, lens)
-        models = mapping.run(mapper, relaxed)
+        models = mapping.run(mapper)
         weak = ""
         if models and models[0].num_reg_images() < len(self.photos):
             before = models[0].num_reg_images()
@@ -173,7 +160,9 @@ class AttemptRunner:
         registered = models[0].num_reg_images() if models else 0
         description = (
             f"{how}{lens_text}: {effort.features} features per photo at {effort.image_size} "
-            f"pixels, {matched.choice.description}, {_MAPPERS[mapper]}: "
+            f"pixels, {matched.choice.description}, {mapper} mapping: "
             f"{registered} of {len(self.photos)} photos registered{weak}{check}"
         )
-        return Attempt(matched, lens, mapping, models, agreement, excluded, doubts, description)
+        return Attempt(
+            matched, self.photos, lens, mapping, models, agreement, excluded, doubts, description
+        )

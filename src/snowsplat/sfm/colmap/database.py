@@ -116,10 +116,13 @@ def set_cameras(path: Path, photos: list[Photo], lens: Lens) -> None:
             connection.execute(f"DELETE FROM {table} WHERE {column} > ?", (max(ids),))
 
 
-def forget_verification(path: Path) -> None:
-    """Remove the results of the verification of matches; the matches are kept."""
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("DELETE FROM two_view_geometries")
+def copy_without_verification(path: Path, target: Path) -> None:
+    """Copy the database to ``target``, without the results of the verification of matches."""
+    remove_database(target)
+    with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(target)) as connection:
+        source.backup(connection)
+        with connection:
+            connection.execute("DELETE FROM two_view_geometries")
 
 
 def remove_database(path: Path) -> None:

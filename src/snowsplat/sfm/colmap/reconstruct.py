@@ -1,34 +1,42 @@
-"""Estimates camera poses from photos, in several attempts with increasing effort.
+"""Estimates camera poses from photos: a list of candidates, of which the most probable one is used.
 
-`PoseEstimation._make_attempts` has the attempts in their order, and when each of them is made:
-first others with the same features and matches, then with more pairs, then with more features, at
-about 4 times the work of the first attempt.
+`CANDIDATES` has the ways to make a model, in the order of their cost. The first one is always
+made. Each of the others is a remedy for one cause of a failure, and is made if the attempts before
+show this cause: if too few photos have poses (`Evidence.usable`), or if the poses do not agree with
+their matches where they agree least (`agreement_of`). Then another model may have a higher `score`.
+The result is the model with the highest one: that which makes the verified matches of all photos,
+and its lenses, most probable.
+
+Together, these take about as long as the first attempt, most of which are features and matches. If
+photos are still missing, more features are detected and matched, which takes about three
+times as long, and the candidates that are `again` are made with these. No choice depends on the
+time that something took, except with `SfmOptions.seconds`, and no candidate changes the matches of
+the first attempt. So an interrupted run ends with the same model.
 
 Before the first attempt, the matches tell whether a camera has a fisheye lens (`fisheye`); so does
-the picture, if it is a disc. After the first attempts, bundle adjustment shows whether one focal
-length fits all photos of a camera. If not, the attempt is made with several, which remain for the
-others (`camera_groups`).
-
-The attempts end when one of them finds poses for 90% of the usable photos (`Evidence.usable`), or
-when the matches show that no further attempt can succeed. If these poses do not agree with the
-matches, some further attempts are made, too. The result is the model with the highest `score`: that
-which makes the verified matches of all photos, and its lenses, most probable.
+the picture, if it is a disc.
 """
 
 from __future__ import annotations
 
 import shutil
 import time
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from snowsplat.project.dataset_folder import DatasetFolder
-from snowsplat.sfm.colmap.attempt import AnyMapper, Attempt, AttemptRunner, Matched
+from snowsplat.sfm.colmap.attempt import Attempt, AttemptRunner, Matched
 from snowsplat.sfm.colmap.checks.consistency import CONSISTENT
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
-from snowsplat.sfm.colmap.checks.score import PairMatches, Score, read_matches, score_of
+from snowsplat.sfm.colmap.checks.score import (
+    PairMatches,
+    Score,
+    have_same_poses,
+    read_matches,
+    score_of,
+)
 from snowsplat.sfm.colmap.database import (
-    forget_verification,
+    copy_without_verification,
     remove_database,
     replace_database,
     set_cameras,
@@ -60,6 +68,23 @@ _NEXT_ATTEMPT = 3.0
 _ZOOM_ATTEMPTS = 3
 
 
+@dataclass(frozen=True)
+class Candidate:
+    """A way to make a model.
+
+    Attributes:
+        name: for readers of this table; the text for users is that of `Attempt.description`.
+        sensible: whether its model may be better than those that were made before.
+        make: makes one or more attempts.
+        again: also with more features.
+    """
+
+    name: str
+    sensible: Callable[[PoseEstimation], bool]
+    make: Callable[[PoseEstimation], object]
+    again: bool = False
+
+
 class PoseEstimation:
     """The attempts for one set of photos. `run` makes them and writes the best result."""
 
@@ -77,11 +102,12 @@ class PoseEstimation:
         progress: WorkerProgress,
     ) -> None:
         self.dataset = dataset
-        self.strong_database = dataset.distorted / "database_strong.db"  # with more features
+        self.other_database = dataset.distorted / "database_other.db"  # with other matches
         self.options = options
         self.runner = AttemptRunner(dataset, photos, options.camera_model, threads, progress)
         self.lens_evidence: dict[int, LensEvidence] = {}  # by camera id
         self.started = time.monotonic()
+        self.how = "as configured"  # the features of the next attempt, as text for users
         self.attempts: list[Attempt] = []
         # The matches of all photos, and the scores of attempts with these; None: they have changed.
         self.pairs: list[PairMatches] | None = None
@@ -104,11 +130,11 @@ class PoseEstimation:
         if not best.models:
             doubts = next((a.doubts for a in self.attempts if a.doubts), [])
             error = failure(self.runner.evidence(self.matched), doubts)
-            remove_database(self.strong_database)
+            remove_database(self.other_database)
             raise error
         self.runner.progress.show_poses(best.models[0], True)
         choice, image_size = self._describe_choice(best), best.matched.effort.image_size
-        exif = exif_focals(self.photos) if best.lens.exif else {}
+        exif = exif_focals(best.photos) if best.lens.exif else {}
         before = [camera.params[0] for camera in best.models[0].cameras.values()]
         models = [best.mapping.complete(model, image_size, exif) for model in best.models]
         same = before == [camera.params[0] for camera in models[0].cameras.values()]
@@ -117,10 +143,10 @@ class PoseEstimation:
         write_models(models, self.dataset.distorted_models)
         names = [names_in(model) for model in models]
         evidence = self.runner.evidence(best.matched)
-        unregistered = explain(self.photos, evidence, names, best.excluded)
-        if best.matched.database == self.strong_database:
-            replace_database(self.dataset.database, by=self.strong_database)
-        remove_database(self.strong_database)
+        unregistered = explain(best.photos, evidence, names, best.excluded)
+        if best.matched.database == self.other_database:
+            replace_database(self.dataset.database, by=self.other_database)
+        remove_database(self.other_database)
         doubts = list(best.doubts)
         if best.agreement < CONSISTENT:
             doubts.append(
@@ -132,77 +158,79 @@ class PoseEstimation:
             )
         return result_of(
             models,
-            self.photos,
+            best.photos,
             exif=best.lens.exif,
             held=best.mapping.held and same,
             unregistered=unregistered,
             pairs=best.matched.choice.description,
             attempts=self.log + choice,
             doubts=doubts + self._doubt_about_fisheye(best),
-            zooms="" if self.photos is given else camera_groups.describe(models[0]),
+            zooms="" if best.photos is given else camera_groups.describe(models[0]),
             agreement=best.agreement,
             fisheye=self._describe_fisheye(best),
         )
 
     def _make_attempts(self, effort: Effort) -> None:
-        """Make as many attempts as needed, the first with ``effort``. Each of the others is a
-        remedy for one cause of a failure, if the attempts before show this cause."""
+        """Make the first attempt with ``effort``, and the other candidates as far as needed."""
         self._match_first(effort)
-        self._try("as configured")
-        if not self._good and self.matched.choice.reserve:
-            # Pairs of similar photos were held in reserve, because places may only look alike.
-            self._verify(self.matched.choice.whole())
-            self._try("with more pairs")
-        if not self._found and self.evidence.flat and exif_focals(self.photos):
-            # With a wrong focal length, the matches may show only a rotation.
-            self.lens = replace(self.lens, exif=False)
-            forget_verification(self.matched.database)
-            self._verify(self.matched.choice)
-            self._try("as configured")
-        if self.lens.fisheyes and not self._good:
-            # The matches, or a disc, may suggest a fisheye lens where there is none.
-            self._try("as configured", lens=replace(self.lens, fisheyes=frozenset(), focals={}))
-            self.lens = self._best().lens
-        if not self._found and self.evidence.more_effort_is_useless:
+        for candidate in CANDIDATES:
+            if candidate.sensible(self):
+                candidate.make(self)
+        if self._enough or self._hopeless:
             return
-        if not self._good or self._contradicts_exif():
-            # The photos may not determine the focal length.
-            self._try("as configured", "incremental", self.lens.fixed)
-        other: Mapper = "incremental" if self.mapper == "global" else "global"
-        if not (self._good or self.evidence.flat):
-            self._try("as configured", other)
-        if not self._enough:
-            self._try("as configured", "plain")
-        self._try_zooms()
-        if not (self._enough or (self._found and self.evidence.matched_all)):
-            self._match_again(self.dataset.database, effort, effort.stronger())
-            self._try("with more pairs and weaker matches", "incremental", weak=True)
-        how, stronger = "with more features, from larger photos", effort.stronger()
-        if not self._enough:
-            self._match_again(self.strong_database, stronger, stronger)
-            self._try(how, weak=True)
-            if not self._enough:
-                self._try(how, "incremental", self.lens.fixed)
-            if not self._enough and not self.evidence.flat:
-                self._try(how, other, weak=True)
+        self.matched = self.runner.match(self.other_database, effort.stronger())
+        self._verify(self.matched.choice)
+        self.how = "with more features, from larger photos"
+        for candidate in CANDIDATES:
+            if candidate.again and candidate.sensible(self):
+                candidate.make(self)
 
     def _try(
-        self,
-        how: str,
-        mapper: AnyMapper | None = None,
-        lens: Lens | None = None,
-        weak: bool = False,
-    ) -> None:
+        self, how: str = "", mapper: Mapper | None = None, lens: Lens | None = None
+    ) -> Attempt:
         """Make an attempt with the last matches; the default is the mapper and the lens of the
-        first attempt. ``weak``: accept weaker matches."""
-        attempt = self.runner.run(how, self.matched, mapper or self.mapper, lens or self.lens, weak)
-        self.attempts.append(attempt)
-        self.log.append(attempt.description)
+        first attempt."""
+        made = self.runner.run(
+            how or self.how, self.matched, mapper or self.mapper, lens or self.lens
+        )
+        self.attempts.append(made)
+        self.log.append(made.description)
+        return made
+
+    def _try_without_exif(self) -> None:
+        """With a wrong focal length, the matches may show only a rotation."""
+        self.lens = replace(self.lens, exif=False)
+        copy_without_verification(self.matched.database, self.other_database)
+        self.matched = replace(self.matched, database=self.other_database)
+        self._verify(self.matched.choice)
+        self._try()
+
+    def _try_without_fisheye(self) -> None:
+        """The matches, or a disc, may suggest a fisheye lens where there is none."""
+        self._try(lens=replace(self.lens, fisheyes=frozenset(), focals={}))
+        self.lens = self._best().lens
+
+    def _try_fixed(self) -> None:
+        """The photos may not determine the focal length."""
+        self._try(mapper="incremental", lens=replace(self.lens, held=True))
+
+    def _try_other_mapper(self) -> None:
+        """A wrong model may agree with the matches better than a right one: before a plane, and
+        where photos of one half of a model have few matches with the other half. So two mappers
+        must agree on the photos of which both have poses; else the model that was made before is
+        kept, if it agrees with its matches, or if the matches cannot tell."""
+        before = self._best()
+        made = self._try(mapper="incremental" if self.mapper == "global" else "global")
+        if not (made.models and before.models) or have_same_poses(made.models[0], before.models[0]):
+            return
+        if self.evidence.flat or before.agreement >= CONSISTENT:
+            self.attempts.remove(made)
+            self.log[-1] += "; not used: its poses are not those of the attempts before"
 
     def _match_first(self, effort: Effort) -> None:
         """The matches and the lens of the first attempt."""
         database = self.dataset.database
-        self.matched = self.runner.match(database, effort, effort, reserve=False)
+        self.matched = self.runner.match(database, effort, reserve=False)
         self.lens_evidence = lens_evidence(database, self.photos, self.matched.scale)
         self.lens = self._first_lens()
         self.runner.verify(self.matched, self.lens)
@@ -218,19 +246,9 @@ class PoseEstimation:
         self.pairs = None
         self.evidence = self.runner.evidence(self.matched)
 
-    def _match_again(self, database: Path, effort: Effort, pairing: Effort) -> None:
-        self.matched = self.runner.match(database, effort, pairing)
-        self.runner.verify(self.matched, self.lens)
-        self.pairs = None
-
     def _try_zooms(self) -> None:
-        """The photos of a camera may have several focal lengths, which remain for the others.
-
-        Fisheye lenses with a zoom are rare, so they are not tried."""
-        lens = self.lens
-        one, best = self.photos, self._best()
-        if lens.any_fisheye or not camera_groups.may_differ(one):
-            return
+        """The photos of a camera may have several focal lengths, which remain for the others."""
+        lens, one, best = self.lens, self.photos, self._best()
         if not self._good:  # bundle adjustment of a bent model does not find a zoom
             pinhole = Lens("SIMPLE_PINHOLE", exif=lens.exif)
             set_cameras(self.matched.database, camera_groups.separate(one), pinhole)
@@ -244,21 +262,15 @@ class PoseEstimation:
                 break
             self.runner.photos = several
             begin = replace(lens, focals=focals_by_camera(several, focals))
-            self._try("with several focal lengths", lens=begin)
-            made, best = self.attempts.pop(), self._best()
-            made_better = bool(made.models) and camera_groups.better(
-                made.models[0], best.models, several=before is not one
-            )
-            if not made_better:
+            made = self._try("with several focal lengths", lens=begin)
+            if self._best() is not made:
                 self.runner.photos = before
                 break
-            self.attempts, lens = [made], begin  # the other models are bent
-            model = made.models[0]
+            self.lens, model = begin, made.models[0]
             focals = camera_groups.focals_of(model) | camera_groups.own_focals(
                 model, self.runner.threads
             )
-        set_cameras(self.matched.database, self.photos, lens)
-        self.lens = lens
+        set_cameras(self.matched.database, self.photos, self.lens)
 
     def _first_lens(self) -> Lens:
         """The lens of the first attempt, with the focal lengths that discs and matches propose."""
@@ -276,8 +288,8 @@ class PoseEstimation:
         """`SfmResult.fisheye` of the attempt ``best``."""
         if not best.lens.fisheyes:
             return ""
-        count = sum(number in best.lens.fisheyes for number in camera_ids(self.photos))
-        which = "the photos are" if count == len(self.photos) else f"{count} photos are"
+        count = sum(number in best.lens.fisheyes for number in camera_ids(best.photos))
+        which = "the photos are" if count == len(best.photos) else f"{count} photos are"
         found = [self.lens_evidence.get(number) for number in best.lens.fisheyes]
         gains = [evidence.gain for evidence in found if evidence is not None and evidence.fisheye]
         if len(gains) < len(found):
@@ -317,7 +329,7 @@ class PoseEstimation:
             self.pairs, self.scores = read_matches(self.matched.database), []
         known = next((score for other, score in self.scores if other is attempt), None)
         if known is None:
-            exif = exif_focals(self.photos)
+            exif = exif_focals(attempt.photos)
             model = attempt.mapping.with_likely_lenses(attempt.models[0], exif)
             known = score_of(model, self.pairs, exif)
             self.scores.append((attempt, known))
@@ -343,6 +355,11 @@ class PoseEstimation:
         return any(attempt.models for attempt in self.attempts)
 
     @property
+    def _hopeless(self) -> bool:
+        """Whether no attempt can find poses."""
+        return not self._found and self.evidence.more_effort_is_useless
+
+    @property
     def _good(self) -> bool:
         """Whether enough photos are registered, in a model that agrees with its matches."""
         consistent = self._best().agreement >= CONSISTENT
@@ -361,6 +378,12 @@ class PoseEstimation:
             return False
         return _NEXT_ATTEMPT * (time.monotonic() - self.started) > self.options.seconds
 
+    @property
+    def _may_miss_exif(self) -> bool:
+        """Whether nothing was found, and the focal length in EXIF may be the reason."""
+        return not self._found and self.evidence.flat and bool(exif_focals(self.photos))
+
+    @property
     def _contradicts_exif(self) -> bool:
         """Whether the best lens is in doubt, and EXIF knows another focal length, which is tried.
 
@@ -369,3 +392,33 @@ class PoseEstimation:
         """
         doubtful = self.lens.exif and bool(self._best().doubts) and not self._late
         return doubtful and bool(exif_focals(self.photos))
+
+    @property
+    def _may_zoom(self) -> bool:
+        """Fisheye lenses with a zoom are rare, so they are not tried."""
+        return not self.lens.any_fisheye and camera_groups.may_differ(self.photos)
+
+
+# In the order of their costs.
+CANDIDATES = (
+    Candidate("first", lambda job: True, PoseEstimation._try, again=True),
+    Candidate("without EXIF", lambda job: job._may_miss_exif, PoseEstimation._try_without_exif),
+    Candidate(
+        "no fisheye",
+        lambda job: bool(job.lens.fisheyes) and not job._good,
+        PoseEstimation._try_without_fisheye,
+    ),
+    Candidate(
+        "a fixed focal length",
+        lambda job: not job._hopeless and (not job._good or job._contradicts_exif),
+        PoseEstimation._try_fixed,
+        again=True,
+    ),
+    Candidate(
+        "other mapper",
+        lambda job: not (job._good or job._hopeless),
+        PoseEstimation._try_other_mapper,
+        again=True,
+    ),
+    Candidate("zooms", lambda job: job._may_zoom and not job._hopeless, PoseEstimation._try_zooms),
+)

@@ -236,7 +236,7 @@ def test_the_model_with_the_most_photos_is_used(mapping, scene, monkeypatch, mad
 def test_an_attempt_is_checked_and_described(mapping, scene, monkeypatch, tmp_path):
     folded = look_alikes.model(scene, folded=True)
     runs = iter([[folded], []])  # of the attempt, and of the repair
-    monkeypatch.setattr(Mapping, "run", lambda self, mapper, relaxed=False: next(runs))
+    monkeypatch.setattr(Mapping, "run", lambda self, mapper: next(runs))
     monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
     progress = WorkerProgress(silent)
     photos = look_alikes.photos()

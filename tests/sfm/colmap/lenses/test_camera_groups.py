@@ -10,10 +10,10 @@ import pytest
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.attempt import Matched
 from snowsplat.sfm.colmap.checks.diagnosis import gather_evidence
+from snowsplat.sfm.colmap.checks.score import read_matches, score_of
 from snowsplat.sfm.colmap.database import set_cameras
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.camera_groups import (
-    better,
     describe,
     focals_of,
     group_by_zoom,
@@ -63,8 +63,7 @@ def attempted(folder, walk, exif=None):
 def test_photos_of_two_zooms_get_two_cameras(tmp_path):
     walk = walks.zoomed(WALK, ALTERNATE)
     job = attempted(tmp_path, walk)
-    (attempt,) = job.attempts
-    model = attempt.models[0]
+    model = job._best().models[0]
     assert model.num_reg_images() == len(walk.centres)
     images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda i: i.name)
     focals = [model.cameras[image.camera_id].mean_focal_length() for image in images]
@@ -127,8 +126,8 @@ def test_photos_with_exif_keep_their_camera():
     assert group_by_zoom([*photos[:6], *scans], focals) is None
 
 
-def test_more_cameras_alone_are_not_better(tmp_path):
+def test_more_cameras_alone_are_not_more_probable(tmp_path):
     (tmp_path / "one").mkdir()
     one, each = mapped(tmp_path / "one", WALK), mapped(tmp_path, WALK, separate)
-    assert not better(each, [one], several=False)
-    assert better(one, [each], several=True)
+    pairs = read_matches(tmp_path / "database.db")
+    assert score_of(one, pairs, {}).total > score_of(each, pairs, {}).total

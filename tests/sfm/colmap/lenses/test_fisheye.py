@@ -98,7 +98,7 @@ def test_a_lens_whose_picture_is_a_disc_begins_near_its_focal_length(tmp_path):
     bent = SimpleNamespace(lens=Lens(), agreement=0.75)
     assert "from a fisheye lens, but" in str(job._doubt_about_fisheye(bent)[0])
     assert job._doubt_about_fisheye(SimpleNamespace(lens=Lens(), agreement=0.99)) == []
-    found = job._describe_fisheye(SimpleNamespace(lens=lens))
+    found = job._describe_fisheye(SimpleNamespace(lens=lens, photos=photos))
     assert found == "the photos are from a fisheye lens: the picture is a disc"
 
 

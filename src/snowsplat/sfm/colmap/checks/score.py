@@ -48,6 +48,12 @@ from snowsplat.sfm.colmap.database import closing_database, verified_pairs
 from snowsplat.sfm.colmap.lenses.lens import pixels_per_radian, used_cameras
 from snowsplat.sfm.colmap.lenses.posterior import OVERDISPERSION
 from snowsplat.sfm.colmap.lenses.prior import log_prior
+from snowsplat.sfm.options import MIN_PHOTOS
+
+# Degrees, between the models of two mappers. Measured: at most 0.41 in 60 pairs of right models of
+# seven captures, and 2.7 where one of them is wrong (a shiny object on a carpet). Formal errors do
+# not tell: right models are 15 to 400 of them apart.
+_SAME_ROTATION = 1.0
 
 
 @dataclass(frozen=True)
@@ -133,3 +139,19 @@ def _distances(model: pycolmap.Reconstruction, pair: PairMatches) -> tuple[Float
     distance = distances_of_matches(pose.rotation.matrix(), pose.translation, *rays)
     side = (max(one.width, one.height) + max(two.width, two.height)) / 2
     return np.where(np.isfinite(distance), focal * distance, np.inf), side
+
+
+def have_same_poses(one: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> bool:
+    """Whether the photos of both models have the same rotations, except for that of the world: the
+    median of the angles between them is at most `_SAME_ROTATION`. True if these are too few."""
+    common = sorted(set(one.reg_image_ids()) & set(other.reg_image_ids()))
+    if len(common) < MIN_PHOTOS:
+        return True
+    a, b = (
+        np.array([model.image(i).cam_from_world().rotation.matrix() for i in common])
+        for model in (one, other)
+    )
+    left, _, right = np.linalg.svd(np.einsum("nji,njk->ik", a, b))
+    world = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    cosine = (np.einsum("nij,jk,nik->n", a, world, b) - 1) / 2
+    return float(np.median(np.arccos(cosine.clip(-1, 1)))) <= math.radians(_SAME_ROTATION)

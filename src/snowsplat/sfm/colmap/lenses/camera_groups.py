@@ -10,7 +10,7 @@ together with poses and points (`own_focals`). These estimates agree within 1% i
 one focal length and determine it, also if the camera focuses while filming. If they form separate
 groups, `group_by_zoom` gives each group a camera of its own. The groups are only a proposal: a flat
 scene does not determine the focal length of each photo. Whether the groups are right is decided by
-the model that is estimated with them (`better`).
+the `score` of the model that is estimated with them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pycolmap
 
-from snowsplat.sfm.colmap.lenses.lens import camera_ids, misfit, robust_adjustment, used_cameras
+from snowsplat.sfm.colmap.lenses.lens import camera_ids, robust_adjustment, used_cameras
 from snowsplat.sfm.ingest.photo import Photo
 
 # Focal lengths of two groups differ by at least this factor. Smaller differences have little effect
@@ -106,25 +106,6 @@ def group_by_zoom(photos: Sequence[Photo], focals: Mapping[int, float]) -> list[
             for i, name in names.items():
                 made[i] = _in_group(photos[i], name)
     return None if made == list(photos) else made
-
-
-def better(
-    model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction], several: bool
-) -> bool:
-    """Whether ``model`` is better than the first of ``others``, which has other cameras.
-
-    It has at least as many photos. With more cameras, it also agrees better with the matches; with
-    fewer cameras, it does not agree worse. ``several``: the other model has several focal lengths,
-    too, so only the groups are in question.
-    """
-    if not others:
-        return True
-    other = others[0]
-    if model.num_reg_images() < other.num_reg_images():
-        return False
-    if len(used_cameras(model)) <= len(used_cameras(other)):
-        return misfit(other) >= (1 - _MIN_GAIN) * misfit(model)
-    return misfit(model) < (1.0 if several else 1 - _MIN_GAIN) * misfit(other)
 
 
 def describe(model: pycolmap.Reconstruction) -> str:

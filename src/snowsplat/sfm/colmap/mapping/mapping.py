@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
 
 import pycolmap
 
@@ -81,25 +80,9 @@ class Mapping:
     forward: bool = False
     show_poses: Callable[[pycolmap.Reconstruction, bool], None] = lambda model, now: None
 
-    def run(
-        self, mapper: Mapper | Literal["plain"], relaxed: bool = False
-    ) -> list[pycolmap.Reconstruction]:
-        """Estimate poses and points; returns the models, the one with the most photos first.
-
-        ``mapper``: "plain" is the incremental mapper with COLMAP's own order of registration.
-        ``relaxed``: accept weaker matches than COLMAP does by default (incremental mapper only).
-        """
-        if mapper == "incremental":
-            models = self._map_incrementally(relaxed)
-        elif mapper == "plain":
-            models = self._map_by(pycolmap.incremental_mapping, self._options(relaxed))
-        else:
-            options = pycolmap.GlobalPipelineOptions()
-            for threaded in (options, options.mapper):
-                threaded.num_threads = self.threads
-                threaded.random_seed = SEED
-            options.mapper.max_normalized_reproj_error *= self.scale
-            models = self._map_by(pycolmap.global_mapping, options)
+    def run(self, mapper: Mapper) -> list[pycolmap.Reconstruction]:
+        """Estimate poses and points; returns the models, the one with the most photos first."""
+        models = self._map_incrementally() if mapper == "incremental" else self._map_globally()
         return usable_models([self._refine(m, scales=_FIRST_LOSS_SCALES) for m in models])
 
     def extend(
@@ -108,7 +91,9 @@ class Mapping:
         """Try to add photos to the first of ``models``, and return all models.
 
         Photos of the other models are tried, too, so that separate models may be joined. If no
-        photo can be added, ``models`` are returned unchanged. ``relaxed`` as in `run`.
+        photo can be added, ``models`` are returned unchanged.
+
+        ``relaxed``: accept weaker matches than COLMAP does by default.
         """
         before = models[0].num_reg_images()
         model = copy.deepcopy(models[0])
@@ -177,7 +162,7 @@ class Mapping:
         with closing_database(self.database) as database:  # they may have another camera model now
             for camera in model.cameras.values():
                 database.update_camera(camera)
-        mapper = self._mapper(ViewGraph.read(self.database), relaxed=False)
+        mapper = self._mapper(ViewGraph.read(self.database))
         mapper.triangulate_all(model, pairs=True)
         self._remove_outliers(model, _MIN_POINTS_ALIGNED)
 
@@ -219,7 +204,7 @@ class Mapping:
     def _min_angle(self) -> float:
         return _MIN_FORWARD_ANGLE if self.forward else _MIN_ANGLE
 
-    def _map_incrementally(self, relaxed: bool) -> list[pycolmap.Reconstruction]:
+    def _map_incrementally(self) -> list[pycolmap.Reconstruction]:
         """Make models one after the other, each from the photos that are in no earlier model.
 
         A small model may be the result of an unsuitable first pair, so its photos remain available:
@@ -228,9 +213,9 @@ class Mapping:
         graph = ViewGraph.read(self.database)
         models: list[pycolmap.Reconstruction] = []
         left, in_small = graph, set[int]()
-        # With weak matches, none can be spared.
-        with nullcontext() if relaxed or self.forward else self._long_tracks() as reduced:
-            mapper = self._mapper(graph, relaxed, reduced)
+        # Of a walk forward, few points are in several photos, so no match can be spared.
+        with nullcontext() if self.forward else self._long_tracks() as reduced:
+            mapper = self._mapper(graph, reduced=reduced)
             for _ in range(_MAX_MODELS):
                 first = self._first(left)
                 enough = len(left.names) >= MIN_PHOTOS
@@ -264,7 +249,7 @@ class Mapping:
             remove_database(reduced)
 
     def _mapper(
-        self, graph: ViewGraph, relaxed: bool, reduced: Path | None = None
+        self, graph: ViewGraph, relaxed: bool = False, reduced: Path | None = None
     ) -> IncrementalMapper:
         def registered(model: pycolmap.Reconstruction) -> None:
             self.report(model.num_reg_images(), len(graph.names), "registered photos")
@@ -288,13 +273,18 @@ class Mapping:
         if len(first) < len(graph.names):
             mapper.grow(model, graph.names, adjust=False)
 
-    def _map_by(self, pipeline: Callable[..., Any], options: Any) -> list[pycolmap.Reconstruction]:
-        """The models that one of COLMAP's own pipelines makes."""
+    def _map_globally(self) -> list[pycolmap.Reconstruction]:
+        options = pycolmap.GlobalPipelineOptions()
+        for threaded in (options, options.mapper):
+            threaded.num_threads = self.threads
+            threaded.random_seed = SEED
+        options.mapper.max_normalized_reproj_error *= self.scale
         options.min_model_size = MIN_PHOTOS
         self.report(0, 0, "registered photos")
         # COLMAP writes each model there as soon as it is complete.
         with new_folder(self.database.with_suffix(".models")) as output:
-            return list(pipeline(self.database, self.images, output, options).values())
+            made = pycolmap.global_mapping(self.database, self.images, output, options)
+        return list(made.values())
 
     def _refine(
         self,
