@@ -44,11 +44,15 @@ def test_attempts_end_early_if_time_is_short(job, seconds, elapsed, registered, 
 
 
 @pytest.mark.parametrize(
-    ("agreement", "good"),
-    [(0.99, True), (0.8, False)],  # the latter: enough photos, but the model is bent
+    ("agreement", "again", "good"),
+    [
+        (0.99, False, True),
+        (0.8, False, False),  # enough photos, but the model is bent
+        (0.8, True, True),
+    ],
 )
-def test_a_bent_model_is_not_good(job, agreement, good):
-    job.attempts = [attempt(9, agreement)]
+def test_a_bent_model_is_not_good(job, agreement, again, good):
+    job.attempts, job.again = [attempt(9, agreement)], again
     assert job._good == good
 
 

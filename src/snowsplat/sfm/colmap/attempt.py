@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 
 from snowsplat.project.dataset_folder import DatasetFolder
-from snowsplat.sfm.colmap.checks.consistency import agreement_of_model
+from snowsplat.sfm.colmap.checks.consistency import agreement_of, check_pairs
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, gather_evidence
 from snowsplat.sfm.colmap.checks.repair import repair
 from snowsplat.sfm.colmap.database import (
@@ -154,8 +154,7 @@ class AttemptRunner:
                 models = []
                 check = f"; impossible: {', '.join(map(str, doubts))}"
         if models:
-            pairs = repaired.pairs if models[0] is repaired.model else None
-            agreement = agreement_of_model(models[0], matched.database, matched.max_error, pairs)
+            agreement = agreement_of(check_pairs(models[0], matched.database, matched.max_error))
         effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
         registered = models[0].num_reg_images() if models else 0
         description = (

@@ -28,13 +28,8 @@ from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.attempt import Attempt, AttemptRunner, Matched
 from snowsplat.sfm.colmap.checks.consistency import CONSISTENT
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
-from snowsplat.sfm.colmap.checks.score import (
-    PairMatches,
-    Score,
-    have_same_poses,
-    read_matches,
-    score_of,
-)
+from snowsplat.sfm.colmap.checks.matches import PairMatches, read_matches
+from snowsplat.sfm.colmap.checks.score import Score, have_same_poses, score_of
 from snowsplat.sfm.colmap.database import (
     copy_without_verification,
     remove_database,
@@ -107,7 +102,7 @@ class PoseEstimation:
         self.runner = AttemptRunner(dataset, photos, options.camera_model, threads, progress)
         self.lens_evidence: dict[int, LensEvidence] = {}  # by camera id
         self.started = time.monotonic()
-        self.how = "as configured"  # the features of the next attempt, as text for users
+        self.again = False  # the matches are those of more features
         self.attempts: list[Attempt] = []
         # The matches of all photos, and the scores of attempts with these; None: they have changed.
         self.pairs: list[PairMatches] | None = None
@@ -180,19 +175,16 @@ class PoseEstimation:
             return
         self.matched = self.runner.match(self.other_database, effort.stronger())
         self._verify(self.matched.choice)
-        self.how = "with more features, from larger photos"
+        self.again = True
         for candidate in CANDIDATES:
             if candidate.again and candidate.sensible(self):
                 candidate.make(self)
 
-    def _try(
-        self, how: str = "", mapper: Mapper | None = None, lens: Lens | None = None
-    ) -> Attempt:
+    def _try(self, mapper: Mapper | None = None, lens: Lens | None = None) -> Attempt:
         """Make an attempt with the last matches; the default is the mapper and the lens of the
         first attempt."""
-        made = self.runner.run(
-            how or self.how, self.matched, mapper or self.mapper, lens or self.lens
-        )
+        how = "with more features, from larger photos" if self.again else "as configured"
+        made = self.runner.run(how, self.matched, mapper or self.mapper, lens or self.lens)
         self.attempts.append(made)
         self.log.append(made.description)
         return made
@@ -262,7 +254,7 @@ class PoseEstimation:
                 break
             self.runner.photos = several
             begin = replace(lens, focals=focals_by_camera(several, focals))
-            made = self._try("with several focal lengths", lens=begin)
+            made = self._try(lens=begin)
             if self._best() is not made:
                 self.runner.photos = before
                 break
@@ -361,9 +353,11 @@ class PoseEstimation:
 
     @property
     def _good(self) -> bool:
-        """Whether enough photos are registered, in a model that agrees with its matches."""
-        consistent = self._best().agreement >= CONSISTENT
-        return self._enough and (consistent or self._late)
+        """Whether enough photos are registered, in a model that agrees with its matches. With more
+        features, no further candidate would make a bent model straight."""
+        if not self._enough or self.again or self._late:
+            return self._enough
+        return self._best().agreement >= CONSISTENT
 
     @property
     def _enough(self) -> bool:

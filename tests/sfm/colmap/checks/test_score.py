@@ -6,12 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.sfm.colmap.checks.score import (
-    PairMatches,
-    have_same_poses,
-    read_matches,
-    score_of,
-)
+from snowsplat.sfm.colmap.checks.matches import PairMatches, read_matches
+from snowsplat.sfm.colmap.checks.score import have_same_poses, score_of
 from snowsplat.sfm.colmap.lenses.prior import log_prior
 
 from .. import look_alikes
@@ -62,7 +58,7 @@ def matches():
             np.concatenate([seen[i] + 0.7 * random.standard_normal((200, 2)), wrong])
             for i, wrong in zip((one, two), false, strict=True)
         ]
-        pairs.append(PairMatches(one + 1, two + 1, *both))
+        pairs.append(PairMatches(one + 1, two + 1, *both, np.zeros((210, 2), int)))
     return pairs
 
 

@@ -10,7 +10,8 @@ import pytest
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.attempt import Matched
 from snowsplat.sfm.colmap.checks.diagnosis import gather_evidence
-from snowsplat.sfm.colmap.checks.score import read_matches, score_of
+from snowsplat.sfm.colmap.checks.matches import read_matches
+from snowsplat.sfm.colmap.checks.score import score_of
 from snowsplat.sfm.colmap.database import set_cameras
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.camera_groups import (
@@ -55,7 +56,7 @@ def attempted(folder, walk, exif=None):
     matched = Matched(dataset.database, EFFORTS["draft"], PairChoice(list(walk.matches), ""), 1.0)
     job.matched, job.mapper, job.lens = matched, "incremental", RADIAL
     job.evidence = gather_evidence(dataset.database, photos, 100)
-    job._try("as configured")
+    job._try()
     job._try_zooms()
     return job
 

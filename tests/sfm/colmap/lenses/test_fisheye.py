@@ -8,7 +8,8 @@ import pycolmap
 import pytest
 
 from snowsplat.project.dataset_folder import DatasetFolder
-from snowsplat.sfm.colmap.checks.consistency import agreement, agreement_of_model
+from snowsplat.scene.epipolar import distances_of_matches
+from snowsplat.sfm.colmap.checks.consistency import agreement_of, check_pairs
 from snowsplat.sfm.colmap.database import closing_database
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.fisheye import lens_evidence
@@ -80,7 +81,7 @@ def test_photos_of_a_fisheye_lens_are_placed(tmp_path, lens):
     centres = np.array([image.projection_center() for image in images])
     steps, true = (np.linalg.norm(c[:, None] - c[None], axis=-1) for c in (centres, WALK.centres))
     np.testing.assert_allclose(steps / steps.max(), true / true.max(), atol=0.005)
-    assert agreement_of_model(model, database, 4.0) > 0.99
+    assert agreement_of(check_pairs(model, database, 4.0)) > 0.99
 
 
 def test_a_lens_whose_picture_is_a_disc_begins_near_its_focal_length(tmp_path):
@@ -147,6 +148,7 @@ def test_matches_behind_the_camera_agree_with_their_pose():
     others = points @ pose.rotation.matrix().T + pose.translation
     rays = [p / np.linalg.norm(p, axis=1, keepdims=True) for p in (points, others)]
     assert (points[:, 2] < 0).sum() > 50
-    assert agreement(pose, *rays, 1e-9) == 1
-    wrong = pycolmap.Rigid3d(pose.rotation, np.array([0.0, 1.0, 0.0]))
-    assert agreement(wrong, *rays, 1e-3) < 0.1
+    rotation = pose.rotation.matrix()
+    assert distances_of_matches(rotation, pose.translation, *rays).max() <= 1e-9
+    wrong = distances_of_matches(rotation, np.array([0.0, 1.0, 0.0]), *rays)
+    assert np.mean(wrong <= 1e-3) < 0.1

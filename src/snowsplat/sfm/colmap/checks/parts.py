@@ -1,25 +1,22 @@
 """Divides the photos of a model into parts that contradict each other.
 
 Two parts of the photos contradict each other if only a small share of the demand between them is
-supported (`find_parts`). The best division is the sparsest cut of the graph: the cut with the least
-ratio of supported demand to demand. This problem is relaxed to a generalised eigenvalue problem
-(Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable constrained clustering: a
-generalized spectral method", AISTATS 2016).
+supported. Parts grow along the pairs that the model confirms, as in Kruskal's algorithm for the
+maximum spanning tree of the view graph, but those that contradict each other are not joined.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from snowsplat.scene.epipolar import Floats
-from snowsplat.sfm.colmap.checks.consistency import CheckedPair, Ints
-from snowsplat.util.components import components
+from snowsplat.sfm.colmap.checks.consistency import CheckedPair
+from snowsplat.sfm.colmap.checks.matches import Ints
 
 # Two parts contradict each other if both of these conditions hold:
 # - At most the share `_MAX_SUPPORT` of the demand between them is supported.
@@ -30,8 +27,6 @@ from snowsplat.util.components import components
 _MAX_SUPPORT = 0.5
 _MIN_TEARS = 3
 _MIN_FOLLOWING_TEARS = 2
-_VECTORS = 6  # number of eigenvectors that are tried
-_THRESHOLDS = 10  # number of thresholds that are tried for each eigenvector
 
 
 def unconfirmed_photos(pairs: Sequence[CheckedPair]) -> set[int]:
@@ -72,8 +67,7 @@ def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
         confirmed[i, j] = confirmed[j, i] = pair.weight * pair.confirmed
         follows[i, j] = follows[j, i] = pair.follows
     graph = _Graph(demand, supported, torn, confirmed, follows)
-    parts = [part for component in _components(demand > 0) for part in _split(graph, component)]
-    parts = sorted(_merge(graph, parts), key=lambda part: (-len(part), part[0]))
+    parts = sorted(_grown_groups(graph), key=lambda part: (-len(part), part[0]))
     kept: list[int] = []
     cut = []
     for part in parts:
@@ -95,31 +89,24 @@ class _Graph:
     follows: NDArray[np.bool_]  # whether the photos follow each other
 
     def contradicts(self, one: Sequence[int], other: Sequence[int]) -> bool:
-        """Whether the model contradicts the matches between two sets of photos."""
-        return self.contradiction(one, other) is not None
+        """Whether the model contradicts the matches between two sets of photos.
 
-    def contradiction(self, one: Sequence[int], other: Sequence[int]) -> float | None:
-        """The supported share of the demand between two sets of photos that contradict each other.
-
-        None if they do not. Pairs of photos that follow each other are also examined on their own.
-        If these pairs contradict the model, the sets contradict each other, whatever the other
-        pairs show: if two whole rooms look alike, hundreds of false pairs agree with each other.
+        Pairs of photos that follow each other are also examined on their own. If these pairs
+        contradict the model, the sets contradict each other, whatever the other pairs show: if two
+        whole rooms look alike, hundreds of false pairs agree with each other.
         """
         across = np.ix_(one, other)
         follows = self.follows[across]
-        shares = [self._contradiction(across, _MIN_TEARS, np.ones_like(follows))]
-        if follows.any():
-            shares.append(self._contradiction(across, _MIN_FOLLOWING_TEARS, follows))
-        return min((share for share in shares if share is not None), default=None)
+        return self._contradicts(across, _MIN_TEARS, np.ones_like(follows)) or (
+            bool(follows.any()) and self._contradicts(across, _MIN_FOLLOWING_TEARS, follows)
+        )
 
-    def _contradiction(
-        self, across: tuple[Ints, ...], tears: int, pairs: NDArray[np.bool_]
-    ) -> float | None:
+    def _contradicts(self, across: tuple[Ints, ...], tears: int, pairs: NDArray[np.bool_]) -> bool:
         torn = _nth_largest(self.torn[across] * pairs, tears)
         if torn <= _nth_largest(self.confirmed[across] * pairs, tears):
-            return None
-        share = float((self.supported[across] * pairs).sum() / (self.demand[across] * pairs).sum())
-        return share if share <= _MAX_SUPPORT else None
+            return False
+        supported, demand = (self.supported[across] * pairs).sum(), self.demand[across] * pairs
+        return bool(supported <= _MAX_SUPPORT * demand.sum())
 
 
 def _nth_largest(values: Floats, n: int) -> float:
@@ -128,46 +115,18 @@ def _nth_largest(values: Floats, n: int) -> float:
     return float(ordered[-n]) if len(ordered) >= n else 0.0
 
 
-def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
-    """The connected components of a graph of N nodes, as sorted lists of nodes. ``linked``: (N, N)
-    symmetric, whether two nodes have an edge."""
-    first, second = np.nonzero(linked)
-    label = components((first, second), len(linked))
-    return [np.flatnonzero(label == node).tolist() for node in np.unique(label)]
-
-
-def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
-    """Divide photos into parts, until no part can be divided into two that contradict each other.
-    Of all candidates, the division with the smallest supported share of the demand is used."""
-    best = None
-    for one in itertools.chain(_grown_groups(graph, photos), _sweep_cuts(graph, photos)):
-        inside = set(one)
-        other = [i for i in photos if i not in inside]
-        share = graph.contradiction(one, other)
-        if share is not None and (best is None or share < best[0]):
-            best = share, one, other
-    if best is None:
-        yield photos
-        return
-    for part in best[1:]:
-        for component in _components(graph.demand[np.ix_(part, part)] > 0):
-            yield from _split(graph, [part[i] for i in component])
-
-
-def _grown_groups(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
-    """Candidates for one side of a cut: groups of photos that are linked by pairs with support.
+def _grown_groups(graph: _Graph) -> list[list[int]]:
+    """Groups of photos that pairs with support link, and that do not contradict each other.
 
     Each photo starts as a group. The pairs of photos that follow each other are processed first,
     then all other pairs; both in the order of `_Graph.confirmed`, the largest value first. Each
-    pair joins the groups of its two photos, unless these groups contradict each other. This finds
-    parts that `_sweep_cuts` does not find: those that have many pairs with the rest of the photos.
+    pair joins the groups of its two photos, unless these groups contradict each other.
     """
-    group = {photo: [photo] for photo in photos}
+    group = {photo: [photo] for photo in range(len(graph.demand))}
     apart: set[tuple[int, int, int, int]] = set()
-    rows, columns = np.nonzero(np.triu(graph.supported[np.ix_(photos, photos)]))
-    edges = np.take(photos, rows), np.take(photos, columns)
+    edges = np.nonzero(np.triu(graph.supported))
     for edge in np.lexsort((-graph.confirmed[edges], ~graph.follows[edges])):
-        one, other = group[photos[rows[edge]]], group[photos[columns[edge]]]
+        one, other = group[edges[0][edge]], group[edges[1][edge]]
         key = (one[0], len(one), other[0], len(other))
         if one is other or key in apart:
             continue
@@ -177,72 +136,4 @@ def _grown_groups(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
         one += other
         for photo in other:
             group[photo] = one
-    groups = {id(members): members for members in group.values()}
-    if len(groups) > 1:
-        yield from (sorted(members) for members in groups.values())
-
-
-def _sweep_cuts(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
-    """Candidates for one side of the sparsest cut of ``photos``: sweep cuts of eigenvectors.
-
-    The photos are sorted by their entries in an eigenvector. The first k photos in this order, for
-    any k, can be one side of a cut. The `_THRESHOLDS` cuts with the least ratio of supported demand
-    to demand are tried.
-    """
-    count = len(photos)
-    if count < 2:
-        return
-    rows = np.ix_(photos, photos)
-    demand, supported = graph.demand[rows], graph.supported[rows]
-    scale = demand.sum() / count
-    ones = np.ones((count, count)) / count
-    # The eigenvalue problem is L(supported) v = λ L(demand) v, where L is the Laplacian. A constant
-    # v is a useless solution. Adding `ones` to L(demand) makes this matrix invertible. Adding twice
-    # `ones` to L(supported) gives the constant v the eigenvalue 2; all others are between 0 and 1.
-    above = _laplacian(supported) / scale + 2 * ones
-    below = _laplacian(demand) / scale + ones
-    inverse = np.linalg.inv(np.linalg.cholesky(below))
-    vectors = inverse.T @ np.linalg.eigh(inverse @ above @ inverse.T)[1][:, :_VECTORS]
-    for vector in vectors.T:
-        order = np.argsort(vector, kind="stable")
-        across_demand = _cut_weights(demand, order)
-        across_supported = _cut_weights(supported, order)
-        ratio = across_supported / np.maximum(across_demand, 1e-300)
-        torn = _cut_weights((graph.torn[rows] > 0).astype(float), order)
-        ratio[torn < _MIN_TEARS] = np.inf
-        for size in np.argsort(ratio, kind="stable")[:_THRESHOLDS] + 1:
-            if ratio[size - 1] <= _MAX_SUPPORT:
-                yield sorted(photos[i] for i in order[:size])
-
-
-def _laplacian(weights: Floats) -> Floats:
-    return np.diag(weights.sum(1)) - weights
-
-
-def _cut_weights(weights: Floats, order: Ints) -> Floats:
-    """(N − 1,) the sum of the weights between the first k photos of ``order`` and the other photos.
-    The entries are those for k = 1, …, N − 1."""
-    sorted_weights = weights[np.ix_(order, order)]
-    # When photo k joins the first photos, its edges to them are not cut any more, and its edges to
-    # the other photos are cut.
-    before = np.tril(sorted_weights).sum(1)
-    return np.cumsum(sorted_weights.sum(1) - 2 * before)[:-1]
-
-
-def _merge(graph: _Graph, parts: list[list[int]]) -> list[list[int]]:
-    """Join parts that have supported demand between them and do not contradict each other. The two
-    parts with the largest supported demand between them are joined first."""
-    parts = [sorted(part) for part in parts]
-    while True:
-        best = None
-        for i, one in enumerate(parts):
-            for j, other in enumerate(parts[:i]):
-                across = np.ix_(one, other)
-                supported = graph.supported[across].sum()
-                linked = supported > 0 and not graph.contradicts(one, other)
-                if linked and (best is None or supported > best[0]):
-                    best = supported, i, j
-        if best is None:
-            return parts
-        _, i, j = best
-        parts[j] = sorted(parts[j] + parts.pop(i))
+    return [sorted(members) for members in {id(found): found for found in group.values()}.values()]

@@ -11,7 +11,7 @@ import pycolmap
 from snowsplat.sfm.colmap.checks.consistency import (
     CONSISTENT,
     CheckedPair,
-    agreement_of_model,
+    agreement_of,
     check_pairs,
 )
 from snowsplat.sfm.colmap.checks.parts import find_parts, unconfirmed_photos
@@ -30,7 +30,6 @@ class Repaired:
     model: pycolmap.Reconstruction
     contradicting: int  # number of photos whose pose contradicted their matches
     excluded: dict[str, Message]  # name -> reason, for those of these photos that have no pose now
-    pairs: list[CheckedPair] | None  # `check_pairs` of the model; None: it has changed since
 
     @property
     def description(self) -> str:
@@ -67,14 +66,13 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     # The image ids of the pairs with false matches, of all rounds.
     false_pairs: set[tuple[int, int]] = set()
     wrong: dict[int, Message] = {}  # image id -> reason, for all photos that had a wrong pose
-    # Models, their wrong photos, and their pairs.
-    found: list[tuple[pycolmap.Reconstruction, set[int], list[CheckedPair] | None]] = []
+    found: list[tuple[pycolmap.Reconstruction, set[int]]] = []  # models, and their wrong photos
     while True:
         names |= {i: image.name for i, image in model.images.items()}
         pairs = check_pairs(model, mapping.database, max_error)
         parts = _parts(pairs, false_pairs)
         doubtful = unconfirmed_photos(pairs).difference(*parts[1:])
-        found.append((model, doubtful.union(*parts[1:]), pairs))
+        found.append((model, doubtful.union(*parts[1:])))
         wrong |= _doubts(model, pairs, doubtful) | _reasons(model, pairs, parts)
         if len(parts) < 2:
             break
@@ -85,12 +83,12 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         if not models:
             break
         model = models[0]
-    model, excluded, checked = max(reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1]))
+    model, excluded = max(reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1]))
     if excluded:
-        model, checked = mapping.without(model, excluded), None
+        model = mapping.without(model, excluded)
     registered = set(model.reg_image_ids())
     reasons = {names[i]: reason for i, reason in wrong.items() if i not in registered}
-    return Repaired(model, len(wrong), reasons, checked)
+    return Repaired(model, len(wrong), reasons)
 
 
 def _parts(pairs: Sequence[CheckedPair], false_pairs: set[tuple[int, int]]) -> list[set[int]]:
@@ -124,8 +122,7 @@ def _registered_again(
     pairs = check_pairs(again, mapping.database, max_error)
     if len(find_parts(pairs)) > 1:
         return []
-    agreement = agreement_of_model(again, mapping.database, max_error, pairs)
-    return [again] if agreement >= CONSISTENT else []
+    return [again] if agreement_of(pairs) >= CONSISTENT else []
 
 
 def _made_again(

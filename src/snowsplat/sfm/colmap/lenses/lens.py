@@ -95,6 +95,7 @@ class Lens:
     def description(self) -> str:
         """As text for users; empty for the first choice."""
         parts = ["as a fisheye lens"] if self.fisheyes else []
+        parts += ["several focal lengths"] if self.focals and not self.any_fisheye else []
         parts += ["a fixed focal length"] if self.held else []
         return " and ".join(parts if self.exif else [*parts, "without the focal length in EXIF"])
 

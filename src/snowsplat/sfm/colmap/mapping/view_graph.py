@@ -83,12 +83,9 @@ class ViewGraph:
         return ids, matches
 
 
-def following_pairs(names: Mapping[int, str], max_step: int = _MAX_STEP) -> set[tuple[int, int]]:
-    """The pairs (first < second) of photos that follow each other by name. ``names``: id -> name
-
-    ``max_step``: the largest difference of their positions in the series of names.
-    """
-    steps = range(1, max_step + 1)
+def following_pairs(names: Mapping[int, str]) -> set[tuple[int, int]]:
+    """The pairs (first < second) of photos that follow each other by name. ``names``: id -> name"""
+    steps = range(1, _MAX_STEP + 1)
     return set().union(*(pairs_following(series, steps) for series in numbered_series(names)))
 
 
