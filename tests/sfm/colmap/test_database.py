@@ -11,6 +11,7 @@ import pytest
 from snowsplat.sfm.colmap.database import (
     VerifiedPair,
     closing_database,
+    copy_without_verification,
     displacement_of,
     feature_counts,
     open_database,
@@ -157,6 +158,23 @@ def test_verified_pairs_have_their_kind(path):
             database.write_two_view_geometry(1, other, geometry)
     pairs = {(p.first, p.second): (p.matches, p.flat) for p in verified_pairs(path)}
     assert pairs == {(1, 2): (20, False), (1, 3): (20, True)}
+
+
+def test_a_copy_without_verification_leaves_the_database_as_it_is(path, tmp_path):
+    """An interrupted run begins with the verification of the first attempt again."""
+    rows = np.stack([np.arange(4), np.arange(4)], 1).astype(np.uint32)
+    found = pycolmap.TwoViewGeometry()
+    found.inlier_matches = rows
+    with closing_database(path) as database:
+        database.write_matches(1, 2, rows)
+        database.write_two_view_geometry(1, 2, found)
+    other = tmp_path / "other.db"
+    copy_without_verification(path, other)
+    assert len(verified_pairs(path)) == 1
+    assert verified_pairs(other) == []
+    with closing_database(other) as database:
+        assert database.exists_matches(1, 2)
+        assert database.num_images() == len(PHOTOS)
 
 
 def test_descriptors_of_the_largest_features_are_read(path):

@@ -316,5 +316,4 @@ def _distances(pair: Pair, rig: Rig) -> np.ndarray:
         distance = np.where(turned[:, 2] > 0, distance, np.inf)
     else:
         distance = distances_of_matches(rotation, baseline, one, two)
-    scale = np.mean([rig.focal[i] * rig.aspect[i] for i in (pair.a, pair.b)])
-    return np.where(np.isfinite(distance), scale * distance, np.inf)
+    return np.mean([rig.focal[i] * rig.aspect[i] for i in (pair.a, pair.b)]) * distance

@@ -39,7 +39,12 @@ from snowsplat.sfm.colmap.database import (
 )
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses import camera_groups
-from snowsplat.sfm.colmap.lenses.fisheye import LensEvidence, lens_evidence
+from snowsplat.sfm.colmap.lenses.fisheye import (
+    LensEvidence,
+    describe_fisheye,
+    doubts_about_fisheye,
+    lens_evidence,
+)
 from snowsplat.sfm.colmap.lenses.lens import (
     Lens,
     camera_ids,
@@ -53,7 +58,7 @@ from snowsplat.sfm.colmap.pairs.choice import PairChoice
 from snowsplat.sfm.colmap.result import names_in, result_of
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import Mapper, SfmOptions
-from snowsplat.util.messages import Message, message
+from snowsplat.util.messages import message
 
 _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
 # The expected time from the start of the job to the end of the next attempt, divided by the time
@@ -97,7 +102,9 @@ class PoseEstimation:
         progress: WorkerProgress,
     ) -> None:
         self.dataset = dataset
-        self.other_database = dataset.distorted / "database_other.db"  # with other matches
+        # With matches that are verified without EXIF, and with more features.
+        self.without_exif = dataset.distorted / "database_without_exif.db"
+        self.strong_database = dataset.distorted / "database_strong.db"
         self.options = options
         self.runner = AttemptRunner(dataset, photos, options.camera_model, threads, progress)
         self.lens_evidence: dict[int, LensEvidence] = {}  # by camera id
@@ -125,10 +132,11 @@ class PoseEstimation:
         if not best.models:
             doubts = next((a.doubts for a in self.attempts if a.doubts), [])
             error = failure(self.runner.evidence(self.matched), doubts)
-            remove_database(self.other_database)
+            self._remove_databases()
             raise error
         self.runner.progress.show_poses(best.models[0], True)
         choice, image_size = self._describe_choice(best), best.matched.effort.image_size
+        set_cameras(best.matched.database, best.photos, best.lens)
         exif = exif_focals(best.photos) if best.lens.exif else {}
         before = [camera.params[0] for camera in best.models[0].cameras.values()]
         models = [best.mapping.complete(model, image_size, exif) for model in best.models]
@@ -139,11 +147,11 @@ class PoseEstimation:
         names = [names_in(model) for model in models]
         evidence = self.runner.evidence(best.matched)
         unregistered = explain(best.photos, evidence, names, best.excluded)
-        if best.matched.database == self.other_database:
-            replace_database(self.dataset.database, by=self.other_database)
-        remove_database(self.other_database)
+        if best.matched.database != self.dataset.database:
+            replace_database(self.dataset.database, by=best.matched.database)
+        self._remove_databases()
         doubts = list(best.doubts)
-        if best.agreement < CONSISTENT:
+        if bent := best.agreement < CONSISTENT:
             doubts.append(
                 message(
                     "the poses may be bent: where they fit least, {share:.0%} of the matches "
@@ -159,11 +167,15 @@ class PoseEstimation:
             unregistered=unregistered,
             pairs=best.matched.choice.description,
             attempts=self.log + choice,
-            doubts=doubts + self._doubt_about_fisheye(best),
+            doubts=doubts + doubts_about_fisheye(best.lens, best.photos, self.lens_evidence, bent),
             zooms="" if best.photos is given else camera_groups.describe(models[0]),
             agreement=best.agreement,
-            fisheye=self._describe_fisheye(best),
+            fisheye=describe_fisheye(best.lens, best.photos, self.lens_evidence),
         )
+
+    def _remove_databases(self) -> None:
+        for database in (self.without_exif, self.strong_database):
+            remove_database(database)
 
     def _make_attempts(self, effort: Effort) -> None:
         """Make the first attempt with ``effort``, and the other candidates as far as needed."""
@@ -173,7 +185,7 @@ class PoseEstimation:
                 candidate.make(self)
         if self._enough or self._hopeless:
             return
-        self.matched = self.runner.match(self.other_database, effort.stronger())
+        self.matched = self.runner.match(self.strong_database, effort.stronger())
         self._verify(self.matched.choice)
         self.again = True
         for candidate in CANDIDATES:
@@ -192,8 +204,8 @@ class PoseEstimation:
     def _try_without_exif(self) -> None:
         """With a wrong focal length, the matches may show only a rotation."""
         self.lens = replace(self.lens, exif=False)
-        copy_without_verification(self.matched.database, self.other_database)
-        self.matched = replace(self.matched, database=self.other_database)
+        copy_without_verification(self.matched.database, self.without_exif)
+        self.matched = replace(self.matched, database=self.without_exif)
         self._verify(self.matched.choice)
         self._try()
 
@@ -275,39 +287,6 @@ class PoseEstimation:
         if not lens.any_fisheye:
             return lens
         return replace(lens, focals=proposed | circles | sure)
-
-    def _describe_fisheye(self, best: Attempt) -> str:
-        """`SfmResult.fisheye` of the attempt ``best``."""
-        if not best.lens.fisheyes:
-            return ""
-        count = sum(number in best.lens.fisheyes for number in camera_ids(best.photos))
-        which = "the photos are" if count == len(best.photos) else f"{count} photos are"
-        found = [self.lens_evidence.get(number) for number in best.lens.fisheyes]
-        gains = [evidence.gain for evidence in found if evidence is not None and evidence.fisheye]
-        if len(gains) < len(found):
-            return f"{which} from a fisheye lens: the picture is a disc"
-        return (
-            f"{which} from a fisheye lens: {min(gains) - 1:.0%} more matches agree with one than "
-            "with any ordinary lens"
-        )
-
-    def _doubt_about_fisheye(self, best: Attempt) -> list[Message]:
-        """A doubt, if the photos seem to be from a fisheye lens, but the model has an ordinary one.
-
-        The model FOV describes fisheye lenses, too. An endoscope shows a disc without one: if poses
-        of an ordinary lens agree with the matches, there is no doubt.
-        """
-        if best.lens.any_fisheye or best.lens.model == "FOV":
-            return []
-        disc = best.agreement < CONSISTENT and any(photo.circle for photo in self.photos)
-        if not disc and not any(evidence.fisheye for evidence in self.lens_evidence.values()):
-            return []
-        return [
-            message(
-                "the photos seem to be from a fisheye lens, but their poses were estimated with an "
-                "ordinary one; state the camera model OPENCV_FISHEYE"
-            )
-        ]
 
     def _best(self) -> Attempt:
         """The attempt whose model is most probable; without a model, the first one."""

@@ -1,7 +1,6 @@
 """Photos of a fisheye lens are recognised by their matches, and their poses are found."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -12,7 +11,11 @@ from snowsplat.scene.epipolar import distances_of_matches
 from snowsplat.sfm.colmap.checks.consistency import agreement_of, check_pairs
 from snowsplat.sfm.colmap.database import closing_database
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress
-from snowsplat.sfm.colmap.lenses.fisheye import lens_evidence
+from snowsplat.sfm.colmap.lenses.fisheye import (
+    describe_fisheye,
+    doubts_about_fisheye,
+    lens_evidence,
+)
 from snowsplat.sfm.colmap.lenses.lens import Lens, cameras_of, findings_of, with_all_parameters
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
 from snowsplat.sfm.colmap.options import CAMERA_MODELS
@@ -96,10 +99,10 @@ def test_a_lens_whose_picture_is_a_disc_begins_near_its_focal_length(tmp_path):
     (camera,) = model.cameras.values()
     assert camera.mean_focal_length() == pytest.approx(WIDE.focal, rel=0.01)
     # The matches of an ordinary attempt, which contradict its poses, do not hide the disc.
-    bent = SimpleNamespace(lens=Lens(), agreement=0.75)
-    assert "from a fisheye lens, but" in str(job._doubt_about_fisheye(bent)[0])
-    assert job._doubt_about_fisheye(SimpleNamespace(lens=Lens(), agreement=0.99)) == []
-    found = job._describe_fisheye(SimpleNamespace(lens=lens, photos=photos))
+    (doubt,) = doubts_about_fisheye(Lens(), photos, {}, bent=True)
+    assert "from a fisheye lens, but" in str(doubt)
+    assert doubts_about_fisheye(Lens(), photos, {}, bent=False) == []
+    found = describe_fisheye(lens, photos, {})
     assert found == "the photos are from a fisheye lens: the picture is a disc"
 
 

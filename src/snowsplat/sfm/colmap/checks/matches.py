@@ -42,9 +42,8 @@ class PairMatches:
         pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
         focal = (pixels_per_radian(one) + pixels_per_radian(two)) / 2
         rotation, translation = pose.rotation.matrix(), pose.translation
-        distance = distances_of_matches(rotation, translation, *self.rays(model))
-        side = (max(one.width, one.height) + max(two.width, two.height)) / 2
-        return np.where(np.isfinite(distance), focal * distance, np.inf), side
+        distance = focal * distances_of_matches(rotation, translation, *self.rays(model))
+        return distance, (max(one.width, one.height) + max(two.width, two.height)) / 2
 
 
 def read_matches(database: Path) -> list[PairMatches]:

@@ -10,7 +10,7 @@ most matches agree is near enough for bundle adjustment.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database, match_counts
 from snowsplat.sfm.colmap.features.extraction import SEED
-from snowsplat.sfm.colmap.lenses.lens import camera_ids
+from snowsplat.sfm.colmap.lenses.lens import Lens, camera_ids
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.util.messages import Message, message
 
 # Focal lengths divided by the longest side of a photo. At the ends, the longest side spans 290° and
 # 55°: an image circle in a wide frame, and a lens that is hardly a fisheye.
@@ -133,3 +134,41 @@ def _ransac(max_error: float) -> pycolmap.RANSACOptions:
     options.min_num_trials, options.max_num_trials = 50, _TRIALS
     options.random_seed = SEED
     return options
+
+
+def describe_fisheye(
+    lens: Lens, photos: Sequence[Photo], evidence: Mapping[int, LensEvidence]
+) -> str:
+    """`SfmResult.fisheye` of a model that began with ``lens``; ``evidence`` by camera id."""
+    if not lens.fisheyes:
+        return ""
+    count = sum(number in lens.fisheyes for number in camera_ids(photos))
+    which = "the photos are" if count == len(photos) else f"{count} photos are"
+    found = [evidence[n].gain for n in lens.fisheyes if n in evidence and evidence[n].fisheye]
+    if len(found) < len(lens.fisheyes):
+        return f"{which} from a fisheye lens: the picture is a disc"
+    return (
+        f"{which} from a fisheye lens: {min(found) - 1:.0%} more matches agree with one than with "
+        "any ordinary lens"
+    )
+
+
+def doubts_about_fisheye(
+    lens: Lens, photos: Sequence[Photo], evidence: Mapping[int, LensEvidence], bent: bool
+) -> list[Message]:
+    """A doubt, if the photos seem to be from a fisheye lens, but the model has an ordinary one.
+
+    The model FOV describes fisheye lenses, too. An endoscope shows a disc without one: if the model
+    is not ``bent``, there is no doubt.
+    """
+    if lens.any_fisheye or lens.model == "FOV":
+        return []
+    disc = bent and any(photo.circle for photo in photos)
+    if not disc and not any(found.fisheye for found in evidence.values()):
+        return []
+    return [
+        message(
+            "the photos seem to be from a fisheye lens, but their poses were estimated with an "
+            "ordinary one; state the camera model OPENCV_FISHEYE"
+        )
+    ]
