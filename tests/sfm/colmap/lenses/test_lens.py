@@ -61,7 +61,7 @@ def test_lenses_of_real_cameras_are_possible(model, params):
 )
 def test_a_lens_in_doubt_is_named(model, params, message):
     (found,) = findings_of(lens(model, params))
-    assert re.search(message, found.text)
+    assert re.search(message, str(found.text))
 
 
 def mapped(tmp_path, walk, exif, lens, **options):
@@ -115,7 +115,7 @@ def test_a_wrong_focal_length_in_exif_is_told(tmp_path, exif):
     found = settle_lens(model, walk.photos(exif), Lens(), refine)
     assert not found.held
     assert found.model.cameras[1].mean_focal_length() == pytest.approx(walks.FOCAL, rel=0.01)
-    (note,) = found.notes
+    (note,) = map(str, found.notes)
     assert f"the focal length in EXIF ({exif:.0f} pixels) does not agree" in note
 
 
