@@ -1,21 +1,18 @@
-"""Reads a HEIC photo of 200 million pixels, as phones take: 3 s, and less than 2 GB of memory.
-
-    PYTHONPATH=src python tests/nightly/large_photos.py
+"""A HEIC photo of 200 million pixels, as phones take: 3 s, and less than 2 GB of memory.
 
 The file has a grid of two tiles, each used 96 times, so that it is written in a second.
 """
 
-import argparse
 import io
-import resource
 import struct
-import tempfile
-from pathlib import Path
 
+import pytest
 from PIL import Image
 from pillow_heif import register_heif_opener
 
 from snowsplat.sfm.ingest.photos import photo_files
+
+from ....fuzz.limits import measured
 
 TILE, COLUMNS, ROWS = 1020, 16, 12
 COLOURS = (20, 60, 200), (200, 120, 60)
@@ -42,18 +39,15 @@ def heic() -> bytes:
     return bytes(data)
 
 
-if __name__ == "__main__":
-    argparse.ArgumentParser(description=__doc__).parse_args()
+@pytest.mark.nightly
+def test_a_photo_of_200_million_pixels(tmp_path):
     register_heif_opener()
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.heic"
-        path.write_bytes(heic())
-        header = photo_files.read_header(path)
-        assert header.size(None) == (COLUMNS * TILE // 2, ROWS * TILE // 2)
-        photo = photo_files.decode(path, header, COLUMNS * TILE // 10)
+    path = tmp_path / "a.heic"
+    path.write_bytes(heic())
+    header = photo_files.read_header(path)
+    assert header.size(None) == (COLUMNS * TILE // 2, ROWS * TILE // 2)
+    photo, memory = measured(lambda: photo_files.decode(path, header, COLUMNS * TILE // 10))
     for place, colour in zip((50, 152), COLOURS, strict=True):
         found = photo.getpixel((place, 50))
         assert all(abs(a - b) < 16 for a, b in zip(found, colour, strict=True)), found
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    print(f"{memory / 1e9:.2f} GB")
     assert memory < 2e9
