@@ -57,8 +57,8 @@ def read_matches(database: Path) -> list[PairMatches]:
                 if i not in pixels:
                     pixels[i] = source.read_keypoints(i)[:, :2].astype(np.float64)
             rows = source.read_two_view_geometry(*both).inlier_matches
-            matched = (pixels[i][rows[:, k]] for k, i in enumerate(both))
-            made.append(PairMatches(*both, *matched, rows))
+            one, two = (pixels[i][rows[:, k]] for k, i in enumerate(both))
+            made.append(PairMatches(*both, one, two, rows))
     return made
 
 
