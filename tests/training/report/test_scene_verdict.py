@@ -51,6 +51,7 @@ def told(verdict: Verdict) -> str:
         (evaluation(0.6, 0.6, 0.6), evaluation(0.8), "poor", "reproduces only 60%"),
         (evaluation(0.6, 0.6, 0.6, contours=0.8), SHARP, "usable", "but 80% of that of contours"),
         (evaluation(-0.2), evaluation(0.3), "poor", "0.3 of"),
+        (evaluation(0.95, 0.96, 0.97, contours=0.3), SHARP, "usable", "only 30% of their"),
         (evaluation(0.95, 0.96, 0.97, ssim=0.6), SHARP, "usable", "blurred in held-out photos"),
         (evaluation(1.0), evaluation(1.0), "good", "reproduces 100%"),
     ],
