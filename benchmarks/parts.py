@@ -2,9 +2,10 @@
 
     python benchmarks/parts.py DATASET... --out out/parts.json
 
-Every arm has the same number of steps, so that only the part differs; see `OFF`. One thread. A
-training that is in the output is not repeated, so the same command resumes. Prints the table of
-docs/learn/from-paper-to-default.md: the mean over the seeds, minus that of `default`.
+Every arm has the same number of steps, and densification every 50 steps, so that only the part
+differs; see `OFF`. One thread. A training that is in the output is not repeated, so the same
+command resumes. Prints the table of docs/learn/from-paper-to-default.md: the mean over the seeds,
+minus that of `default`.
 """
 
 from __future__ import annotations
@@ -19,10 +20,14 @@ from typing import Any
 from snowsplat import Trainer, load_dataset, ops, recipe
 from snowsplat.training.settings.rates import LearningRates
 
+RATES = ("means", "means_final", "log_scales", "quats", "sh_dc", "sh_rest")
 #: The part -> the settings that are changed: they are those of the paper, or leave the part out.
 OFF: dict[str, dict[str, Any]] = {
     "default": {},
-    "rates": {"learning_rates": LearningRates(means_steps=1.0)},
+    "rates": {
+        **{f"lr_{name}": getattr(LearningRates(), name) for name in RATES},
+        "lr_sh_rest_passes": 40.0,
+    },
     "sweep": {"init": "points", "initial_points": 1.0},
     "ball": {"initial_opacity": 0.1, "initial_scale": 1.0},
     "coarse": {"coarse_to_fine": (0, 0)},
