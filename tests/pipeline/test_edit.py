@@ -158,7 +158,8 @@ def test_scale_view_and_title(scene, tmp_path):
     with viewed_scene(target) as viewed:
         page = viewed.files[""].content.decode()
     assert '"title": "New"' in page
-    assert '"chosen": true' in page
+    initial = settings_of(tmp_path / "again")["cameras"][0]["initial"]
+    assert np.allclose(initial["position"], VIEW[:3], atol=0.1)
     # Another edit goes on from there: sizes and numbers add up, the view stays.
     rest = N - 1
     again = edit(target, tmp_path / "again", PageEdit(rest, bits(np.arange(rest) < 5), 0.5))

@@ -91,6 +91,14 @@ def key(page: Page, name: str, *, control: bool = False, at: float | None = None
         )
 
 
+# Whether the first handle has not moved for a second.
+STILL = """(() => {
+    const { left } = document.querySelector(".snow-handle").getBoundingClientRect();
+    if (left !== window.lastLeft) [window.lastLeft, window.since] = [left, performance.now()];
+    return performance.now() - window.since > 1000;
+})()"""
+
+
 @pytest.mark.usefixtures("in_process")
 def test_box_and_level_by_clicks(studio, finished):
     floor = tilted_floor()
@@ -108,6 +116,7 @@ def test_box_and_level_by_clicks(studio, finished):
         press(page, "Box")
         # x points to the left in the first view: the right handle is that of the lower side.
         page.wait_for("document.querySelector('.snow-handle').style.transform !== ''")
+        page.wait_for(STILL)  # the view flies to the box
         before, (x, y) = faces(page), middle_of(page, 0)
         first = page.evaluate("document.querySelector('.snow-handle').getBoundingClientRect().left")
         page.drag(x, y, x - 60, y)

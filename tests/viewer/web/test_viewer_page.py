@@ -65,6 +65,8 @@ def test_the_page_is_unchanged_except_for_inserted_values():
     theirs, ours = asset("index.html").splitlines(), page("scene", {}).splitlines()
     assert [line.strip() for line in theirs if line not in ours] == [
         "<title>SuperSplat Viewer</title>",
+        'content="width=device-width, initial-scale=1.0, maximum-scale=1.0, user-scalable=no, '
+        'viewport-fit=cover"',
         '<base href="" />',
         '<script type="application/json" id="sse-bootstrap">',
         "null",
