@@ -142,6 +142,8 @@ def test_contours_of_a_hazy_image_and_of_a_shifted_one():
     mask = x < 150
     wrong = torch.where(mask[:, :, None], photo, 1.0 - photo)
     assert compare(wrong, photo, mask).contours == pytest.approx(1.0)
+    # The border of a mask is no contour.
+    assert compare(photo.roll(8, 1), photo, mask).contours < 0.3
     assert compare(photo, torch.full_like(photo, 0.5)).contours == 0.0  # none
 
 

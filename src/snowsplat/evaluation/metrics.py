@@ -221,17 +221,19 @@ def _explained(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
 
 def _contours(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
     """`ViewMetrics.contours`; 0 for a photo without any."""
-    if mask is not None:
-        image, target = (each * mask[:, :, None] for each in (image, target))
-    pair = torch.stack([image, target]).permute(0, 3, 1, 2)
-    factor = _CONTOUR_SIDE / max(pair.shape[-2:])
+    used = torch.ones_like(target[:, :, :1]) if mask is None else mask[:, :, None].to(target.dtype)
+    # Masked pixels are those of the photo in both images, and do not count.
+    image = torch.where(used > 0.0, image, target)
+    stacked = torch.cat([image, target, used], dim=2).permute(2, 0, 1)[None]
+    factor = _CONTOUR_SIDE / max(stacked.shape[-2:])
     if factor < 1.0:
-        size = [max(1, round(side * factor)) for side in pair.shape[-2:]]
-        pair = interpolate(pair, size, mode="area")
-    around = avg_pool2d(pair, _AROUND, 1, _AROUND // 2, count_include_pad=False)
-    x, y = (pair - around).to(torch.float64)
-    total = float(y.square().sum())
-    return 1.0 - float((x - y).square().sum()) / total if total > 0.0 else 0.0
+        size = [max(1, round(side * factor)) for side in stacked.shape[-2:]]
+        stacked = interpolate(stacked, size, mode="area")
+    around = avg_pool2d(stacked, _AROUND, 1, _AROUND // 2, count_include_pad=False)
+    x, y, _ = ((stacked - around)[0].to(torch.float64)).split([3, 3, 1])
+    weight = stacked[0, 6:].to(torch.float64)
+    total = float((weight * y.square()).sum())
+    return 1.0 - float((weight * (x - y).square()).sum()) / total if total > 0.0 else 0.0
 
 
 @torch.no_grad()

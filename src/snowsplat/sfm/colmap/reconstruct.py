@@ -70,16 +70,14 @@ _ZOOM_ATTEMPTS = 3
 
 @dataclass(frozen=True)
 class Candidate:
-    """A way to make a model.
+    """A way to make a model. The text for users is that of `Attempt.description`.
 
     Attributes:
-        name: for readers of this table; the text for users is that of `Attempt.description`.
         sensible: whether its model may be better than those that were made before.
         make: makes one or more attempts.
         again: also with more features.
     """
 
-    name: str
     sensible: Callable[[PoseEstimation], bool]
     make: Callable[[PoseEstimation], object]
     again: bool = False
@@ -374,24 +372,21 @@ class PoseEstimation:
 
 # In the order of their costs.
 CANDIDATES = (
-    Candidate("first", lambda job: True, PoseEstimation._try, again=True),
-    Candidate("without EXIF", lambda job: job._may_miss_exif, PoseEstimation._try_without_exif),
+    Candidate(lambda job: True, PoseEstimation._try, again=True),
+    Candidate(lambda job: job._may_miss_exif, PoseEstimation._try_without_exif),
     Candidate(
-        "no fisheye",
         lambda job: bool(job.lens.fisheyes) and not job._good,
         PoseEstimation._try_without_fisheye,
     ),
     Candidate(
-        "a fixed focal length",
         lambda job: not job._hopeless and (not job._good or job._contradicts_exif),
         PoseEstimation._try_fixed,
         again=True,
     ),
     Candidate(
-        "other mapper",
         lambda job: not (job._good or job._hopeless),
         PoseEstimation._try_other_mapper,
         again=True,
     ),
-    Candidate("zooms", lambda job: job._may_zoom and not job._hopeless, PoseEstimation._try_zooms),
+    Candidate(lambda job: job._may_zoom and not job._hopeless, PoseEstimation._try_zooms),
 )

@@ -24,8 +24,8 @@ from snowsplat.util.names import first_names
 #: of the photo (1 / √10); at 0.75, a half: contours are doubled or missing.
 _GOOD, _USABLE = 0.9, 0.75
 #: If this share of the contours of the typical held-out photo is reproduced, none are doubled or
-#: missing: only smooth areas, such as a white wall, differ. In 15 captures with right poses, it is
-#: 0.49 to 0.85; if each camera is turned by a degree, 0.3 and less. Below the second value, they
+#: missing: only smooth areas, such as a white wall, differ. In 16 captures with right poses, it is
+#: 0.49 to 0.97; if each camera is turned by a degree, 0.3 and less. Below the second value, they
 #: are doubled or blurred, even where large areas make most of the contrast.
 _CONTOURS, _DOUBLED = 0.6, 0.4
 #: A single photo below this share shows something else than the scene.
