@@ -26,6 +26,7 @@ import threading
 import time
 import xml.etree.ElementTree as ET
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
@@ -275,6 +276,17 @@ class Page:
         if path is not None:
             path.write_bytes(data)
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+    def wait_for_picture(
+        self, fits: Callable[[np.ndarray], bool], timeout: float = 30.0
+    ) -> np.ndarray:
+        """The first screenshot for which ``fits`` is true: frames are late on a busy machine."""
+        end = time.monotonic() + timeout
+        while not fits(shown := self.screenshot()):
+            if time.monotonic() > end:
+                raise BrowserError(f"not in {timeout:.0f} s: the expected picture")
+            time.sleep(0.1)
+        return shown
 
     def click(self, x: float, y: float) -> None:
         """Click with the left button; x and y are pixels from the upper left corner."""

@@ -2,7 +2,6 @@
 
 import json
 import math
-import time
 
 import numpy as np
 import pytest
@@ -123,13 +122,7 @@ def psnr(shown: np.ndarray, scene: ReadyScene, kept: torch.Tensor) -> float:
 
 def soon_shown(page: Page, scene: ReadyScene, kept: torch.Tensor) -> np.ndarray:
     """A picture of the page that shows the Gaussians kept."""
-    for _ in range(20):
-        shown = page.screenshot()
-        best = psnr(shown, scene, kept)
-        if best > 30:
-            return shown
-        page.evaluate("new Promise(done => setTimeout(done, 250))")
-    raise AssertionError(f"the picture of the page differs: PSNR {best:.1f} dB")
+    return page.wait_for_picture(lambda shown: psnr(shown, scene, kept) > 30)
 
 
 @pytest.mark.browser
@@ -188,7 +181,5 @@ def test_a_page_without_cameras_begins_without_floaters(tmp_path):
         soon_shown(page, scene, torch.arange(1010) < 1000)
         brightness = page.screenshot().mean()
         set_sliders(page, 0, 0)
-        end = time.monotonic() + 30
-        while page.screenshot().mean() < brightness + 10:
-            assert time.monotonic() < end, "no floater appears"
+        page.wait_for_picture(lambda shown: shown.mean() >= brightness + 10)  # the floaters
         assert not page.errors

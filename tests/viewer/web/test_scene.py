@@ -4,8 +4,6 @@ import dataclasses
 import json
 import math
 import re
-import time
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -163,7 +161,7 @@ def test_a_real_browser_shows_our_render(trained, tmp_path):
     ):
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
-        shown = soon(page, lambda shown: psnr(shown, ours) > 30)
+        shown = page.wait_for_picture(lambda shown: psnr(shown, ours) > 30)
         page.screenshot(tmp_path / "viewer.png")  # for inspection
         assert shown.std() > 10
         assert np.corrcoef(shown.ravel(), ours.ravel())[0, 1] > 0.98
@@ -195,7 +193,7 @@ def test_a_real_browser_shows_levels_of_detail(trained, tmp_path):
     ):
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
-        soon(page, lambda shown: psnr(shown, ours) > 29)
+        page.wait_for_picture(lambda shown: psnr(shown, ours) > 29)
         counts = read_index(tmp_path / INDEX).counts()
         # Behind the camera, coarser levels are enough.
         page.wait_for(f"window.app.stats.frame.gsplats > {counts[0] // 2}", 60)
@@ -224,7 +222,7 @@ def test_a_real_browser_shows_an_antialiased_scene(trained, tmp_path):
     ):
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
-        shown = soon(page, lambda shown: psnr(shown, ours) > 30)
+        shown = page.wait_for_picture(lambda shown: psnr(shown, ours) > 30)
         page.screenshot(tmp_path / "viewer.png")  # for inspection
         assert shown.mean() == pytest.approx(ours.mean(), rel=0.05)
         assert picture(unfiltered, camera_of(start)).mean() > 1.2 * shown.mean()
@@ -241,13 +239,13 @@ def with_controls(browser: Browser, server: WebServer, before: np.ndarray) -> No
     page: Page = browser.open(f"{server.url}?webgl")
     page.wait_for(LOADED, 60)
     assert page.evaluate(mode) == "orbit"
-    still = page.screenshot().astype(float)
-    assert psnr(still, before) > 12  # except for the controls
+    # Except for the controls.
+    still = page.wait_for_picture(lambda shown: psnr(shown, before) > 12)
     page.drag(WIDTH / 2, HEIGHT / 2, WIDTH / 2 + 120, HEIGHT / 2 + 20)
-    turned = soon(page, lambda shown: psnr(shown, still) < 22)
+    turned = page.wait_for_picture(lambda shown: psnr(shown, still) < 22)
     page.evaluate(f"window.sse.viewer.seek({FILM_SECONDS / 2})")
     assert page.evaluate(mode) == "anim"
-    soon(page, lambda shown: psnr(shown, turned) < 22)
+    page.wait_for_picture(lambda shown: psnr(shown, turned) < 22)
     page.drag(WIDTH / 2, HEIGHT / 2, WIDTH / 2 + 120, HEIGHT / 2 + 20)
     page.wait_for(f"{mode} === 'orbit'", 30)
     assert not page.errors
@@ -266,15 +264,6 @@ def test_the_film_follows_the_photos(trained):
     places = [camera.position.tolist() for camera in trained.cameras]
     for view in film:
         assert min(math.dist(view.position, (x, -z, y)) for x, y, z in places) < 0.3 * extent
-
-
-def soon(page: Page, fits: Callable[[np.ndarray], bool]) -> np.ndarray:
-    """The first screenshot that matches: frames may be late on a slow machine."""
-    end = time.monotonic() + 30
-    while not fits(shown := page.screenshot().astype(float)):
-        assert time.monotonic() < end, "the expected image was not shown in time"
-        time.sleep(0.2)
-    return shown
 
 
 def _similarity(scale: float, rotation: list[list[float]]) -> Similarity:
