@@ -266,6 +266,16 @@ LENSES = {
         "THIN_PRISM_FISHEYE",
         (0.01, 0, 1e-3, 0, 0, 0, 0, 0),
     ),
+    "thin prism": (
+        {"camera_model": "THIN_PRISM_FISHEYE", "k1": 0.01, "sx1": 0.02, "sy1": -0.03},
+        "THIN_PRISM_FISHEYE",
+        (0.01, 0, 0, 0, 0, 0, 0.02, -0.03),
+    ),
+    "aria by names": (
+        {"camera_model": "FISHEYE624", "k1": 0.01, "p0": 1e-3, "s3": 1e-3},
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+        (0.01, *(0,) * 5, 1e-3, *(0,) * 4, 1e-3),
+    ),
     "aria": (
         {"camera_model": "FISHEYE624", "distortion_params": [0.01] * 6 + [1e-3] * 6},
         "RAD_TAN_THIN_PRISM_FISHEYE",
@@ -294,6 +304,26 @@ def test_lenses_of_transforms_json(tmp_path, name):
     with ImageLoader(dataset.train) as images:
         for view in dataset.train:
             check(view, lens, images.get(view), error=9.0)
+
+
+def test_a_model_is_added_by_a_line_of_the_table(tmp_path, monkeypatch):
+    """Mei and Rives 2007: its coefficient is read by the name in the table, or the file is refused."""
+    from snowsplat.data.lens.lens import Lens, Model
+    from snowsplat.data.readers import transforms_lens
+
+    def unified(lens, x, y, z):
+        depth = z + lens.coefficients[0] * np.sqrt(x * x + y * y + z * z)
+        return x / depth, y / depth
+
+    model = Model("UNIFIED", ("fx", "fy", "cx", "cy", "xi"), unified, ("UNIFIED",))
+    monkeypatch.setitem(transforms_lens._MODELS, "UNIFIED", model)
+    common = {**INTRINSICS, "camera_model": "UNIFIED"}
+    dataset = load_dataset(write_json(tmp_path, {**common, "xi": 0.3}), hold_out=None)
+    with ImageLoader(dataset.train) as images:
+        for view in dataset.train:
+            check(view, Lens(model, W, H, (*OPENCV[:4], 0.3)), images.get(view), error=9.0)
+    with pytest.raises(UserError, match="distortion_params: should be 1 numbers"):
+        load_dataset(write_json(tmp_path, {**common, "x_i": 0.3}), hold_out=None)
 
 
 def test_a_polynomial_of_the_eighth_degree(tmp_path):

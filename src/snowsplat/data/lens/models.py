@@ -130,7 +130,7 @@ _F, _FXY = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
 _OPENCV = (*_FXY, "k1", "k2", "p1", "p2")
 _RATIONAL = (*_OPENCV, "k3", "k4", "k5", "k6")
 _BROWN = (*_FXY, "k1", "k2", "k3", "k4", "p1", "p2", "skew")
-_THIN_PRISM = (*_OPENCV, "k3", "k4", "s1", "s2")
+_THIN_PRISM = (*_OPENCV, "k3", "k4", "sx1", "sy1")
 _ARIA = (*_FXY, "k1", "k2", "k3", "k4", "k5", "k6", "p0", "p1", "s0", "s1", "s2", "s3")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.data.lens import models
-from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.lens import Lens, Model
 from snowsplat.data.photos.decode import read_header
 from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective, valid_size
@@ -54,12 +54,6 @@ def lens_of(where: str, values: Mapping[str, Any], image: Path) -> Lens:
     if any(key.startswith("ftheta_p") for key in values):
         model = "F-Theta"
     kind = _MODELS.get(model)
-    if kind is not None and kind.equation is models.aria_fisheye:
-        count = len(kind.parameters) - len(intrinsics)
-        numbers = parse.numbers(
-            f"{where}: distortion_params", values.get("distortion_params"), count
-        )
-        return Lens(kind, width, height, (*intrinsics, *numbers.tolist()))
     if kind is None:
         raise UserError(
             "{where}: the camera model {model} is not known; undistort the photos with the "
@@ -68,6 +62,8 @@ def lens_of(where: str, values: Mapping[str, Any], image: Path) -> Lens:
             model=model[:40],
         )
     listed = values.get("distortion_params")
+    if kind.equation not in (models.opencv, models.fisheye):
+        return Lens(kind, width, height, (*intrinsics, *_coefficients(where, values, kind)))
     if isinstance(listed, list):
         k1, k2, k3, k4, p1, p2 = parse.numbers(f"{where}: distortion_params", listed, 6).tolist()
         k5 = k6 = 0.0
@@ -82,6 +78,17 @@ def lens_of(where: str, values: Mapping[str, Any], image: Path) -> Lens:
         params = (*intrinsics, k1, k2, p1, p2, k3, k4, k5, k6)
         return models.lens_of("FULL_OPENCV", width, height, params)
     return perspective(where, width, height, intrinsics, radial, (p1, p2))
+
+
+def _coefficients(where: str, values: Mapping[str, Any], kind: Model) -> list[float]:
+    """The coefficients of a model: all in one list, or by their names in the table of models; those
+    that are not stated are 0. Raises UserError: none is stated."""
+    names = kind.parameters[kind.parameters.index("cy") + 1 :]
+    by_name = [stated(where, values, name) for name in names]
+    listed = values.get("distortion_params")
+    if isinstance(listed, list) or all(value is None for value in by_name):
+        return parse.numbers(f"{where}: distortion_params", listed, len(names)).tolist()
+    return [value or 0.0 for value in by_name]
 
 
 def stated(where: str, values: Mapping[str, Any], key: str) -> float | None:
