@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.scene.rasterization import rasterization
     from snowsplat.training.core.trainer import Trainer
-    from snowsplat.training.parts.list import parts_of
+    from snowsplat.training.parts.list import parts_of, register_part
     from snowsplat.training.parts.part import Part
     from snowsplat.training.settings.config import TrainConfig
     from snowsplat.training.settings.recipes import recipe
@@ -111,6 +111,7 @@ _MODULES = {
     "rasterization": "scene.rasterization",
     "read_gaussians": "formats",
     "recipe": "training.settings.recipes",
+    "register_part": "training.parts.list",
     "refine_photo": "extras.lift.refine_photo",
     "render_images": "pipeline.render",
     "render_video": "pipeline.videos",
@@ -166,6 +167,7 @@ __all__ = [
     "read_gaussians",
     "recipe",
     "refine_photo",
+    "register_part",
     "render_images",
     "render_video",
     "resume",

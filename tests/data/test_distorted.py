@@ -307,7 +307,7 @@ def test_lenses_of_transforms_json(tmp_path, name):
 
 
 def test_a_model_is_added_by_a_line_of_the_table(tmp_path, monkeypatch):
-    """Mei and Rives 2007: its coefficient is read by the name in the table, or the file is refused."""
+    """Mei and Rives 2007: its coefficient is read by its name, or the file is refused."""
     from snowsplat.data.lens.lens import Lens, Model
     from snowsplat.data.readers import transforms_lens
 

@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 
 from snowsplat.util.flags import settings_from
 from snowsplat.util.messages import Message, as_message, message
-from snowsplat.util.settings import Settings, switch
+from snowsplat.util.own_files import own_files
+from snowsplat.util.settings import Settings, setting, switch
 
 _OF_MESSAGE = {each.name for each in fields(Message)}
 
@@ -32,6 +33,15 @@ class Command(Settings):
     """
 
     given: ClassVar[Mapping[str, Any]] = {}
+    # `main` imports them before it parses the values of the flags, which they can extend.
+    imports: tuple[Path, ...] = setting(
+        (),
+        "Run a Python file first, which registers parts of the training, recipes, starts, formats "
+        "or subcommands of your own; repeat the flag for more.",
+        metavar="FILE",
+        name="import",
+        repeated=True,
+    )
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Command:
@@ -105,7 +115,8 @@ def print_message(key: str | Message, /, **values: Any) -> None:
 
 def next_step(purpose: Message, *words: object) -> Message:
     """A purpose and the command for it: "to see it: snowsplat view 'my garden'"."""
-    command = shlex.join(["snowsplat", *map(str, words)])
+    own = [word for file in own_files() for word in ("--import", file)]
+    command = shlex.join(["snowsplat", *map(str, words), *own])
     return message("{purpose}: {command}", purpose=purpose, command=command)
 
 

@@ -52,7 +52,7 @@ def with_file(command: type[Command], given: Mapping[str, Any]) -> dict[str, Any
     for key, value in content.items():
         spelling = f"--{key}".replace("_", "-")
         flag = flags.get(spelling)
-        if flag is None or flag.key == KEY:
+        if flag is None or flag.key in (KEY, "import"):  # a file of settings runs no code
             names = [name[2:] for name in flags if name.startswith("--")]
             advice = suggestion(spelling[2:], names) or message("remove it")
             raise UserError(

@@ -25,6 +25,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import redirect_stderr, suppress
 from io import TextIOWrapper
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from snowsplat._version import __version__
@@ -36,6 +37,7 @@ from snowsplat.util.errors import SettingError, UserError, message_of
 from snowsplat.util.flags import with_flags
 from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.messages import Message, as_message, language_of_environment, message, use
+from snowsplat.util.own_files import import_own_files
 from snowsplat.util.safe_json import printable
 
 if TYPE_CHECKING:
@@ -140,6 +142,7 @@ def parse(arguments: Sequence[str]) -> Command:
     Raises: UserError: an unknown subcommand, or invalid or refused flags.
     """
     name, *rest = arguments
+    import_own_files(_imports(rest))
     name = _FORMER_NAMES.get(name, name)
     if name not in SUBCOMMANDS and not name.startswith("-"):
         raise UserError(_unknown_subcommand(name))
@@ -171,6 +174,12 @@ def parse(arguments: Sequence[str]) -> Command:
 
         given = with_file(command, given)
     return command.of(given)
+
+
+def _imports(words: Sequence[str]) -> list[str]:
+    """The files of `--import`, which are needed before the other flags are known."""
+    after = [file for flag, file in pairwise(words) if flag == "--import"]
+    return after + [w.removeprefix("--import=") for w in words if w.startswith("--import=")]
 
 
 def _with_flags(message: str, arguments: Sequence[str]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Sequence
 from dataclasses import field, make_dataclass
+from keyword import iskeyword
 from typing import Annotated, Any, Optional, Union
 
 import tyro
@@ -30,7 +31,7 @@ def parse(
         flag.key: value
         for command in commands.values()
         for flag in (flags_of(command) if command is not None else ())
-        if (value := getattr(parsed, flag.key)) != _not_given(flag)
+        if (value := getattr(parsed, _attribute(flag))) != _not_given(flag)
     }
 
 
@@ -45,6 +46,7 @@ def _field(flag: Flag) -> tuple[str, Any, Any]:
     declared, kind, value = flag.declared, flag.type, _not_given(flag)
     marks: list[Any] = [
         tyro.conf.arg(
+            name=flag.key if iskeyword(flag.key) else None,
             metavar=declared.metavar or None,
             aliases=list(declared.aliases) or None,
             help_behavior_hint=f"(default: {flag.default})" if flag.default else "",
@@ -61,7 +63,12 @@ def _field(flag: Flag) -> tuple[str, Any, Any]:
     help = with_flags(declared.help)
     parts = (kind, *marks)
     annotated: Any = Annotated[parts]
-    return flag.key, annotated, field(default=value, metadata={"help": help})
+    return _attribute(flag), annotated, field(default=value, metadata={"help": help})
+
+
+def _attribute(flag: Flag) -> str:
+    """The name of its field."""
+    return f"{flag.key}_" if iskeyword(flag.key) else flag.key
 
 
 def _not_given(flag: Flag) -> Any:

@@ -55,6 +55,7 @@ from snowsplat.util.duration import duration
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import atomic_path, check_output, remove_temporaries
 from snowsplat.util.messages import message
+from snowsplat.util.own_files import own_files
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json
 from snowsplat.util.stages import Stages
@@ -320,6 +321,8 @@ class _Job:
         else:
             settings["minutes"] = self.options.minutes
         settings |= {**_split(self.options), "exposure": self.options.exposure}
+        if files := own_files():
+            settings["import"] = files
         folder = self.folder
         outputs = [self.file, folder.point_clouds, folder.metrics]
         result = self._stage("scene", settings, outputs, lambda: self._train(settings, plan))

@@ -48,6 +48,7 @@ from snowsplat.util.files import shown
 from snowsplat.util.flags import settings_from
 from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.messages import Message, message
+from snowsplat.util.own_files import import_own_files
 from snowsplat.util.run_lock import locked
 from snowsplat.util.safe_json import from_json
 
@@ -250,6 +251,7 @@ def _answer(verb: Verb, scene: StudioScene, given: dict[str, Any]) -> dict[str, 
 
 def main(words: list[str]) -> int:
     logging.basicConfig(level=logging.WARNING)
+    import_own_files()
     name, folder, *settings = words
     scene = StudioScene(Path(folder))
     if name in TASKS:

@@ -35,6 +35,7 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.interrupts import ended_by_signals, ended_together
 from snowsplat.util.machine import peak_bytes, processor_name
+from snowsplat.util.own_files import import_own_files, own_files
 from snowsplat.util.run_lock import InUse, locked
 from snowsplat.util.safe_json import from_json, read_json
 
@@ -60,6 +61,7 @@ class Job:
     output: str
     recipe: str
     settings: dict[str, Any] = field(default_factory=dict)
+    imports: list[str] = field(default_factory=own_files)  # see `--import`
     resolution: int | None = None
     hold_out: int = 8  # unless the dataset has a split of its own
     lpips: str | None = None
@@ -206,6 +208,7 @@ def _end_with_parent() -> None:
 def main() -> int:
     """Returns the exit code."""
     request = json.loads(sys.stdin.readline())
+    import_own_files()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     job = from_json(Job, request["job"])
     sys.argv = ["snowsplat", "benchmark", "-o", str(Path(job.output).parent)]  # for `Holder`

@@ -120,7 +120,7 @@ def _check_own(present: set[str], saved: set[str]) -> None:
                 "the checkpoint: was made without the part {name!r}; leave it out again: parts=[…]",
                 name=key,
             )
-        how = "parts=[…]" if what == "part" else "loss=…"
+        how = "parts=[…], --import FILE" if what == "part" else "loss=…"
         raise UserError(
             "the checkpoint: was made with the {what} {name!r}, which is not part of the "
             "package; pass it again: {how}",

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection
+from typing import TYPE_CHECKING, TypeVar
 
 from snowsplat.training.parts.decay import Decay
 from snowsplat.training.parts.densification import Densification
@@ -23,6 +23,23 @@ from snowsplat.util.messages import Message
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
+
+_Factory = TypeVar("_Factory", bound=Callable[[], Part])
+_REGISTERED: list[Callable[[], Part]] = []
+
+
+def register_part(make: _Factory) -> _Factory:
+    """Let a part take part in all trainings of this process; also a decorator of a class.
+
+    ``make``: called without arguments for each training.
+    """
+    _REGISTERED.append(make)
+    return make
+
+
+def registered_parts() -> list[Part]:
+    """New objects of the parts of `register_part`; they come after those of `parts_of`."""
+    return [make() for make in _REGISTERED]
 
 
 def parts_of(config: TrainConfig) -> list[Part]:
