@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat import load_dataset, read_gaussians
+from snowsplat import load_dataset, read_gaussians, recipe
 from snowsplat.cli import main as cli
 from snowsplat.formats.ply import read_ply
 from snowsplat.pipeline.blocks.content import Cell, block_content, cut, ground_axes
@@ -114,6 +114,7 @@ def test_a_block_is_an_ordinary_dataset_without_copies(dataset, planned):
     plan = Plan.read(planned)
     whole = {view.name: view for view in load_dataset(dataset, hold_out=8).train}
     assert [block.name for block in plan.blocks] == ["block_01", "block_02", "block_03"]
+    assert (recipe().exposure, plan.settings["exposure"]) == ("auto", "off")
     for block in plan.blocks:
         own = load_dataset(planned / block.name / "dataset", hold_out=None)
         assert len(own.train) == block.views

@@ -143,7 +143,8 @@ def plan_blocks(
 
 def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
     _check_free(folder)
-    config = recipe(options.recipe, **options.settings)
+    given: dict[str, Any] = {"exposure": "off", **options.settings}
+    config = recipe(options.recipe, **given)
     if config.exposure != "off":
         raise SettingError("exposure", "would learn other gains in each block; use off")
     train_options = TrainOptions(
@@ -152,8 +153,7 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
         hold_out=options.hold_out,
         test_list=options.test_list,
     )
-    settings = train_options.dataset_settings(dataset)
-    settings, files = read_undamaged(settings)
+    settings, files = read_undamaged(train_options.dataset_settings(dataset))
     whole = files.dataset(settings.resolution)
     check_cameras(whole, settings.path, trusted=True)
     if options.blocks > len(whole.train):
@@ -170,14 +170,13 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
     axes, contents = block_content(whole, options.blocks, options.margin)
     sizes = sorted(view.camera.width * view.camera.height for view in whole.train)
     config = config.capped(sizes[len(sizes) // 2], len(sizes))
-    shared = dict(options.settings)
     if config.sky and not config.sky_distance:  # so that the parts of the sky fit
         distance = sky_distance([view.camera for view in whole.train])
-        shared["sky_distance"] = float(f"{distance:.4g}")
+        given["sky_distance"] = float(f"{distance:.4g}")
     plan = Plan(
         settings,
         options.recipe,
-        shared,
+        given,
         axes,
         options.margin,
         [],

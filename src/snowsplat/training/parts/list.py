@@ -71,7 +71,6 @@ def hints(run: Run, settings: Collection[str]) -> list[Message]:
 
     ``settings``: names of those that the user has chosen.
     """
-    if run.config.exposure != "off" or "exposure" in settings:
-        return []
-    hint = exposure_hint(run)
+    off = run.config.exposure == "off" and "exposure" not in settings
+    hint = exposure_hint(run) if off else None
     return [] if hint is None else [hint]

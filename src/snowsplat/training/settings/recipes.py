@@ -31,7 +31,7 @@ def default() -> TrainConfig:
     0.1 are removed, and their places are used again; no Gaussian is much nearer to a camera than
     the points that it sees; densification lasts longer, uses absolute gradients, and always reaches
     the maximum number; more Gaussians and fewer steps take the same time; objects that move between
-    the photos are masked; and the scene is antialiased.
+    the photos are masked; gains correct different exposures; and the scene is antialiased.
     """
     config = classic()
     return replace(
@@ -51,6 +51,7 @@ def default() -> TrainConfig:
         relative_scale=0.3,
         near_limit=0.6,
         transients="auto",
+        exposure="auto",
         antialias=True,
         density=replace(
             config.density,
