@@ -2,11 +2,8 @@
 
 import contextlib
 import io
-import json
 import random
-import threading
 import time
-from dataclasses import asdict
 from pathlib import Path
 from urllib.parse import quote
 
@@ -19,8 +16,6 @@ from websockets.exceptions import ConnectionClosedOK
 from websockets.sync.client import connect
 
 from snowsplat.studio import job
-from snowsplat.util import run_lock
-from snowsplat.util.run_lock import Holder
 from snowsplat.viewer.http.server import WebServer
 
 from ..viewer import clients
@@ -128,26 +123,6 @@ def test_a_damaged_scene_does_not_hide_the_others(studio):
     listed = {scene["name"]: scene["status"] for scene in studio.ask("scenes")[1]}
     assert listed == {name: "failed", other: "new"}
     assert studio.ask(f"scenes/{name}")[0] == 400
-
-
-def test_a_lock_of_another_computer_holds_nothing_up(studio, finished, monkeypatch):
-    """As of a container that was killed, whose name the next one does not have."""
-    finished.lock().write_text(json.dumps(asdict(Holder("elsewhere", 5, "", ""))))
-    asked, judged = threading.Event(), threading.Event()
-
-    def is_renewed(file):
-        asked.set()
-        return not judged.wait(30)
-
-    monkeypatch.setattr(run_lock, "_is_renewed", is_renewed)
-    answers = []
-    listing = threading.Thread(target=lambda: answers.append(studio.ask("scenes")[1]))
-    listing.start()
-    assert asked.wait(30)
-    assert studio.ask("about")[0] == 200
-    judged.set()
-    listing.join(30)
-    assert [scene["status"] for scene in answers[0]] == ["done"]
 
 
 def test_small_photos_of_a_dataset(studio):
