@@ -42,6 +42,7 @@ from snowsplat.formats import (
     FORMATS,
     GaussianArrays,
     format_for_reading,
+    gsplat_checkpoint,
     read_gaussians,
     usd,
     write_gaussians,
@@ -169,11 +170,7 @@ def _scene(file: str) -> Reader:
     )
 
 
-def _spz(
-    name: str, version: int, pack: Callable[[bytes], bytes] | None = None, links: bytes = b""
-) -> Reader:
-    """``links``: of a tree of levels of detail of 30 Gaussians."""
-
+def _spz(name: str, version: int, pack: Callable[[bytes], bytes] | None = None) -> Reader:
     def make(folder: Path) -> None:
         path = folder / "a.spz"
         write_spz(path, GaussianArrays.from_gaussians(make_scene(30, 2)), max(version, 2))
@@ -182,8 +179,8 @@ def _spz(
         columns = unpack(path.read_bytes()).columns
         if version == 1:
             columns[0] = bytes(range(30)) * 6
-        head = struct.pack("<4sIIBBBB", b"NGSP", version, 30, 2, 12, 0x80 if links else 0, 0)
-        path.write_bytes(head + b"".join([*columns, links]))
+        head = struct.pack("<4sIIBBBB", b"NGSP", version, 30, 2, 12, 0, 0)
+        path.write_bytes(head + b"".join(columns))
 
     read = _reads("a.spz")
     return Reader(name, "a.spz", make, read, pack=pack)
@@ -315,10 +312,6 @@ def _ply() -> bytes:
         return (Path(folder) / "a.ply").read_bytes()
 
 
-_PLACE_OF_SPLAT = {"position": [1, 2, 3], "rotation": [0, 1, 0, 0], "scale": [2, 2, 2]}
-_PROJECT = json.dumps({"splats": [{**_PLACE_OF_SPLAT, "visible": True, "saturation": 1}]}).encode()
-
-
 def _zip_reader(name: str, file: str, valid: Callable[[], bytes], **more: Any) -> Reader:
     return Reader(
         name, file, lambda folder: (folder / file).write_bytes(valid()), _reads(file), **more
@@ -343,8 +336,10 @@ def _make_origin(folder: Path) -> None:
 def _reads(file: str) -> Callable[[Path], Any]:
     def read(folder: Path) -> Gaussians:
         # A USD file has been read within this limit in a child process, for which no test waits.
-        limit = address_limit(limited_child._MEMORY) if "usd" in file else contextlib.nullcontext()
-        with limit, mock.patch.object(usd, "check_readable"):
+        in_child = {"usd": usd, ".pt": gsplat_checkpoint}
+        module = next((module for part, module in in_child.items() if part in file), None)
+        limit = address_limit(limited_child._MEMORY) if module else contextlib.nullcontext()
+        with limit, mock.patch.object(module or usd, "check_readable"):
             scene = read_gaussians(folder / file)
         if format_for_reading(folder / file).name != "PLY":  # a PLY is read unchanged
             assert bool(scene.usable_rows().all())
@@ -688,7 +683,6 @@ READERS: tuple[Reader, ...] = (
     *(_ksplat(level) for level in (0, 1, 2)),
     *(_spz(f"scene spz {version}", version) for version in (1, 2, 3, 4)),
     _spz("scene spz 3, in gzip", 3, gzip.compress),
-    _spz("scene spz 2, a tree", 2, links=struct.pack("<30H", 29, *[0] * 29) + bytes(120)),
     *(_sog_part(member) for member in ("meta.json", "means_l.webp", "shN_centroids.webp")),
     Reader("scene sog, a folder", "meta.json", _sog_folder, _reads("meta.json"), json=True),
     Reader("levels of detail", INDEX, _make_levels, _reads(INDEX), json=True),
@@ -706,14 +700,13 @@ READERS: tuple[Reader, ...] = (
     Reader("scene a.ply of other trainers", "a.ply", _variant_ply, _reads("a.ply")),
     _zip_reader("scene in a zip file", "a.zip", lambda: _zipped({}, "a.ply")(_ply())),
     _zip_reader("scene in a zip file, its PLY", "a.zip", _ply, pack=_zipped({}, "a.ply")),
-    _zip_reader(
-        "scene ssproj, its document",
-        "a.ssproj",
-        lambda: _PROJECT,
-        json=True,
-        pack=lambda data: _zipped({"splat_0.ply": _ply()}, "document.json")(data),
+    Reader(
+        "gsplat checkpoint",
+        "ckpt_7_rank0.pt",
+        _gsplat,
+        _reads("ckpt_7_rank0.pt"),
+        extra=lambda _: limited_child._MEMORY,
     ),
-    Reader("gsplat checkpoint", "ckpt_7_rank0.pt", _gsplat, _reads("ckpt_7_rank0.pt")),
     Reader("origin of a scene", "a.spz.origin.json", _make_origin, _reads("a.spz"), json=True),
     Reader("points a.ply", "a.ply", _make_points, lambda folder: read_points(folder / "a.ply")),
     *(_dataset("colmap-bin", f"sparse/0/{part}.bin") for part in ("cameras", "images", "points3D")),

@@ -70,8 +70,6 @@ _SH_STEPS = (2, 4)
 def read_spz(path: Path) -> GaussianArrays:
     """Read a scene of version 1 to 4. Coefficients of SH degree 4 are ignored.
 
-    Of a tree of levels of detail of Spark, the finest level is read.
-
     Raises: UserError: the file cannot be read, has another version, is damaged or truncated, or
     declares an implausible number of Gaussians.
     """
@@ -90,8 +88,6 @@ def parse_spz(path: Path, data: bytes) -> GaussianArrays:
         np.frombuffer(column, np.uint8).reshape(n, -1 if n else width)
         for column, width in zip(columns, header.columns(), strict=True)
     ]
-    if contents.children:
-        rows = _leaves(path, rows, np.frombuffer(contents.children, "<u2"))
     if header.flags & ANTIALIASED and is_of_spark(data):
         logger.warning(
             "%s: seems to be of Spark, which marks all scenes as antialiased (if it was not "
@@ -111,20 +107,6 @@ def parse_spz(path: Path, data: bytes) -> GaussianArrays:
     )
     scene = packing.flip_axes(stored, _signs(contents.extensions))
     return usable_gaussians(path, *scene, antialiased=bool(header.flags & ANTIALIASED))
-
-
-def _leaves(path: Path, rows: list[np.ndarray], children: np.ndarray) -> list[np.ndarray]:
-    """The rows of the Gaussians without children, with opacities as in a file without a tree.
-
-    The others are merged Gaussians, which may be more than opaque; so all opacities are halved.
-    """
-    if len(children) != 1 + int(children.sum()):  # all but the root are the child of one Gaussian
-        logger.warning(
-            "%s: is a part of a scene in levels of detail; give all parts to convert", path
-        )
-    leaves = [column[children == 0] for column in rows]
-    leaves[1] = np.minimum(leaves[1], 127) * 2 + (leaves[1] > 127)
-    return leaves
 
 
 @reads

@@ -4,9 +4,6 @@ Versions 1 to 3 have a header of 16 bytes and the columns, compressed by gzip (s
 uncompressed). Version 4 has a header of 32 bytes, extensions, a table with the packed and
 unpacked size of each column, and the columns, each in a zstd stream; empty columns are omitted.
 
-Spark writes version 2, also with a tree of levels of detail: after the columns, the number of
-children of each Gaussian (2 bytes) and its first child (4 bytes). The leaves are the scene.
-
 The sizes that a file declares are compared with the size of the file before memory is allocated.
 """
 
@@ -29,7 +26,6 @@ _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
 _HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fraction, flags, streams
 _HEADER_BYTES = 32  # of version 4
-_LINK_BYTES = 6  # of a Gaussian in a tree
 _SPARK = bytes.fromhex("1f8b08000000000000ff")  # other writers of .spz name a system in the last
 _EXTENSION_LIMIT = 1 << 16
 
@@ -58,14 +54,12 @@ class Header:
 class Contents:
     """The unpacked columns of position, opacity, colour, scales, rotation, SH.
 
-    ``children``: the number of children of each Gaussian, 2 bytes each; empty without `LEVELS`.
     Invariant: each column has the size that follows from the header.
     """
 
     header: Header
     columns: list[bytes]
     extensions: bytes
-    children: bytes = b""
 
 
 def is_spz(head: bytes) -> bool:
@@ -128,8 +122,7 @@ def _unpack(data: bytes) -> Contents:
     for width in header.columns():
         columns.append(body[start : start + width * header.count])
         start += width * header.count
-    children = body[start : start + 2 * header.count] if header.flags & LEVELS else b""
-    return Contents(header, columns, body[size:] if header.flags & EXTENDED else b"", children)
+    return Contents(header, columns, body[size:] if header.flags & EXTENDED else b"")
 
 
 def _gunzip(data: bytes, most: int) -> tuple[bytes, bool]:
@@ -147,8 +140,7 @@ def _gunzip(data: bytes, most: int) -> tuple[bytes, bool]:
 
 
 def _body_bytes(header: Header) -> int:
-    links = _LINK_BYTES if header.flags & LEVELS else 0
-    return (sum(header.columns()) + links) * header.count
+    return sum(header.columns()) * header.count
 
 
 def _header(head: bytes, file_size: int) -> Header:
@@ -161,6 +153,8 @@ def _header(head: bytes, file_size: int) -> Header:
             "version {version} of .spz; supported are 1 to 4",
             version=header.version,
         )
+    if header.flags & LEVELS:
+        raise Unsupported("a tree of levels of detail of Spark; use the file it was made from")
     if header.sh_degree > 4 or header.fractional_bits > 31:
         raise _damaged()
     check_count(header.count, file_size)

@@ -73,7 +73,7 @@ def attack(url: str, seconds: float, **kinds: int) -> subprocess.Popen[str]:
 
 
 def test_the_training_continues_bit_identically(watched, dataset, capfd):
-    """The scene is the same as without clients. For the server's share, see test_time_limit.py."""
+    """The scene is the same as without clients."""
     for kinds in (
         {"half_open": 10, "strangers": 4},  # of the first, a thousand connections
         {

@@ -20,13 +20,9 @@ from uvicorn.config import Config
 from uvicorn.server import ServerState
 
 from snowsplat.viewer.hosts import ANY_HOST, BACKLOG, KnownHosts, listen
-from snowsplat.viewer.http.guard import (
-    HEAD_SIZE,
-    IDLE_SECONDS,
-    MESSAGE_SIZE,
-    Guard,
-    HttpConnection,
-)
+from snowsplat.viewer.http.guard import HEAD_SIZE, MESSAGE_SIZE, Connection, Guard
+
+_IDLE_SECONDS = 60  # after which a connection without a further request is closed
 
 _log = logging.getLogger(__name__)
 
@@ -51,7 +47,6 @@ class WebServer:
     ) -> None:
         hosts = KnownHosts(host, allow_host)
         self.host = host
-        self._app = app
         self.token = secrets.token_urlsafe(16)
         self._guard = Guard(app, hosts, self.token, headers or {})
         self._socket = listen(host, port)
@@ -103,13 +98,15 @@ class WebServer:
 
     async def _serve(self) -> None:
         config = Config(
-            self._app,
+            self._guard,
             ws="websockets-sansio",
             interface="asgi3",
             lifespan="off",
             proxy_headers=False,
             log_config=None,
-            timeout_keep_alive=int(IDLE_SECONDS),
+            log_level=logging.CRITICAL + 1,  # uvicorn logs each malformed request
+            access_log=False,
+            timeout_keep_alive=_IDLE_SECONDS,
             h11_max_incomplete_event_size=HEAD_SIZE,
             ws_max_size=MESSAGE_SIZE,
             ws_per_message_deflate=False,
@@ -117,13 +114,14 @@ class WebServer:
         config.load()
         state = ServerState()
         server = await self._loop.create_server(
-            lambda: HttpConnection(self._guard, config, state, {}, self._loop),
+            lambda: Connection(config, state, {}, self._loop),
             sock=self._socket,
             backlog=BACKLOG,
         )
         await self._closing.wait()
         server.close()
-        self._guard.close()
+        for connection in state.connections:
+            connection.transport.abort()
         for task in state.tasks:
             task.cancel()
         await asyncio.gather(*state.tasks, return_exceptions=True)

@@ -1,17 +1,13 @@
-"""`NetworkViewer`: a page for any number of browsers, and the images that they request.
-
-`ServerTimeLimit`: a server in the process that trains must not slow it down.
-"""
+"""`NetworkViewer`: a page for any number of browsers, and the images that they request."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import html
 import itertools
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,9 +46,6 @@ _POLL = 2.0  # seconds between two checks for a newer scene
 _TITLE = "<title>snowsplat</title>"
 
 _log = logging.getLogger(__name__)
-_SHARE = 0.2  # share of a core that the server uses
-_LONGEST_PAUSE = 1.0  # seconds for which the server is paused at a time
-_MEASURED_EVERY = 0.05  # seconds between two measurements of the server's processor time
 
 
 @dataclass(frozen=True)
@@ -127,10 +120,8 @@ class NetworkViewer:
                 **self._photos.description(),
             }
         )
-        self._time_limit = ServerTimeLimit(lambda: self.session.training)
         policy = {"Content-Security-Policy": POLICY}
         self.server = WebServer(self._app(label), host, port, allow_host, policy)
-        self.server.call(self._time_limit.measure)
         self.url, self.others = self.server.url, self.server.others
 
     def close(self) -> None:
@@ -246,8 +237,7 @@ class NetworkViewer:
         browser = next((b for b in self._browsers if b.visitor is request.visitor), None)
         try:
             if browser is not None:  # None: the browser has disconnected
-                with self._time_limit.uncounted():
-                    browser.show(jpeg(image, _QUALITY[request.kind]), request.view.number)
+                browser.show(jpeg(image, _QUALITY[request.kind]), request.view.number)
         except Exception:
             self.session.arrived(request.visitor, 1)
             raise
@@ -304,32 +294,3 @@ class NetworkViewer:
                 scene.gaussians, scene.number, training=False
             ):
                 self.wait()
-
-
-class ServerTimeLimit:
-    """Limits the share of a core that the thread of a server uses during training."""
-
-    def __init__(self, training: Callable[[], bool]) -> None:
-        """``training``: whether the limit holds at present."""
-        self._training = training
-        # At the last measurement, in seconds: processor time of the thread, and the clock.
-        self._used = self._measured = 0.0
-        self._uncounted = 0.0  # processor time since then that is not counted, in seconds
-
-    def measure(self) -> None:
-        """Begin; it runs in the event loop of the server, and pauses its thread if necessary."""
-        used = time.thread_time() - self._used - self._uncounted
-        pause = used / _SHARE - (time.monotonic() - self._measured)
-        if self._measured and pause > 0.0 and self._training():
-            time.sleep(min(pause, _LONGEST_PAUSE))
-        self._used, self._measured, self._uncounted = time.thread_time(), time.monotonic(), 0.0
-        asyncio.get_running_loop().call_later(_MEASURED_EVERY, self.measure)
-
-    @contextlib.contextmanager
-    def uncounted(self) -> Iterator[None]:
-        """A context for work that the training has started: its time is not limited."""
-        before = time.thread_time()
-        try:
-            yield
-        finally:
-            self._uncounted += time.thread_time() - before
