@@ -72,8 +72,8 @@ PARTS = {
     "scene": Part(("scene/*.py",), ("tests/scene",)),
     "trajectory": Part(("trajectory/*.py",), ("tests/trajectory",)),
     "reference": Part(("ops/*reference.py",), tuple(f"tests/ops/test_{op}.py" for op in _OPS)),
-    "data": Part(("data/**/*.py",), ("tests/data",)),
-    "formats": Part(("formats/*.py",), ("tests/formats",)),
+    "data": Part(("data/**/*.py",), ("tests/data", "tests/fuzz")),
+    "formats": Part(("formats/*.py",), ("tests/formats", "tests/fuzz")),
 }
 
 
