@@ -441,8 +441,6 @@ HOSTILE: dict[str, Callable[[str, float], None]] = {
     "strangers": _strangers,
     "comers": _comers,
 }
-#: Against any server.
-HOSTILE_TO_ANY = ("half open", "long head", "strangers")
 
 
 def hostile(kind: str, url: str, seconds: float) -> None:
