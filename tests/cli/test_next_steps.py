@@ -11,6 +11,7 @@ from snowsplat.cli.command import next_step, see_and_share
 from snowsplat.cli.main import SUBCOMMANDS
 from snowsplat.cli.subcommands import _WORDS
 from snowsplat.formats import write_gaussians
+from snowsplat.util import messages
 from snowsplat.util.messages import message
 
 
@@ -72,3 +73,18 @@ def test_info_tells_sizes_and_what_is_next(run, scene):
     lines = run("info", scene).out.splitlines()
     assert [line for line in lines if re.match(r"size +\d+ kB$", line)]
     assert lines[-1].startswith("to see it: snowsplat view ")
+
+
+def test_info_in_chinese(run, scene, monkeypatch):
+    """Chinese characters take two columns."""
+    monkeypatch.setattr(messages, "_current", messages.language())  # it is restored at the end
+    monkeypatch.setenv("LC_ALL", "zh_CN.UTF-8")
+    lines = run("info", scene).out.splitlines()
+    assert lines[0].split() == ["种类", "场景"]
+    assert not [line for line in lines if re.match("[a-z]+ ", line)]
+    before = [re.split(r"(?<=\S) +(?=\S)", line)[0] for line in lines[:3]]
+    starts = [
+        2 * len(label) + len(line) - len(line[len(label) :].lstrip()) - len(label)
+        for label, line in zip(before, lines, strict=False)
+    ]
+    assert len(set(starts)) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,28 @@ from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import printable
 from snowsplat.util.settings import needed
+
+_OF_ANY = message("kind"), message("path"), message("file"), message("size"), message("next")
+_KINDS = [message("scene"), message("point cloud"), message("checkpoint"), message("output folder")]
+_KINDS += [message("zip file"), message("photos"), message("video"), message("dataset")]
+_OF_SCENES = [message("format"), message("lost in it"), message("encoding"), message("gaussians")]
+_OF_SCENES += [message("gaussians per level"), message("points"), message("sh degree")]
+_OF_SCENES += [message("antialiased"), message("size in memory"), message("not finite")]
+_OF_SCENES += [message("opacity"), message("scale"), message("longest to shortest axis")]
+_PLACES = [message("bounds"), message("bounds of 98 percent"), message("origin")]
+_PLACES += [message("metres per unit"), message("extent")]
+_OF_RUNS = [message("step"), message("tensors"), message("background"), message("scenes")]
+_OF_RUNS += [message("checkpoints"), message("metrics"), message("last scene")]
+_OF_DATASETS = [message("description"), message("held out with eval"), message("sizes")]
+_OF_DATASETS += [message("focal length pixels"), message("masks"), message("depth maps")]
+_OF_DATASETS += [message("normal maps"), message("impossible"), message("doubtful")]
+_OF_PHOTOS = [message("videos"), message("files"), message("formats"), message("cameras")]
+_OF_PHOTOS += [message("with focal length"), message("with gps"), message("with attitude")]
+_OF_PHOTOS += [message("with transparency"), message("not used"), message("unused masks")]
+_OF_PHOTOS += [message("and"), message("camera poses")]
+_GROUPS = _OF_ANY, _KINDS, _OF_SCENES, _PLACES, _OF_RUNS, _OF_DATASETS, _OF_PHOTOS
+#: What facts are called; the names of settings and tensors are in no language.
+_LABELS = {label.key: label for labels in _GROUPS for label in labels}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,16 +92,21 @@ def _next(facts: dict[str, Any], path: Path) -> list[Message]:
 
 def _print(facts: dict[str, Any], indent: str = "") -> None:
     """Print one line per fact; a dict that contains dicts or lists is indented below its name."""
-    facts = {
-        # "bytes_in_memory" -> "size in memory"
-        re.sub("^bytes", "size", name): format_bytes(value) if name.startswith("bytes") else value
-        for name, value in facts.items()
-    }
-    width = max(len(name) for name in facts)
+    lines = []
     for name, value in facts.items():
-        label = f"{indent}{name.replace('_', ' '):{width}}"
+        # "bytes_in_memory" -> "size in memory"
+        key = re.sub("^bytes", "size", name).replace("_", " ")
+        label = printable(str(_LABELS.get(key, key)))
+        if name.startswith("bytes"):
+            value = format_bytes(value)
+        elif name == "kind":
+            value = _LABELS[value]
+        lines.append((indent + label, value))
+    width = max(_columns(label) for label, _ in lines)
+    for label, value in lines:
+        label += " " * (width - _columns(label))
         if isinstance(value, dict) and any(isinstance(v, dict | list) for v in value.values()):
-            print(printable(label.rstrip()))
+            print(label.rstrip())
             _print(value, indent + "  ")
         elif isinstance(value, dict):
             inner = ", ".join(f"{k} {_text(v)}" for k, v in value.items())
@@ -87,16 +115,21 @@ def _print(facts: dict[str, Any], indent: str = "") -> None:
             print(printable(f"{label} {_text(value)}"))
 
 
+def _columns(text: str) -> int:
+    """The columns of a text in a terminal, where Chinese characters take two."""
+    return sum(2 if unicodedata.east_asian_width(each) in "FW" else 1 for each in text)
+
+
 def _text(value: Any) -> str:
     if isinstance(value, bool) or value is None:
-        return {True: "yes", False: "no", None: "-"}[value]
+        return "-" if value is None else str(message("yes") if value else message("no"))
     if isinstance(value, int):
         return f"{value:,}"
     if isinstance(value, list):
         return (
             " … ".join(map(_text, value))
             if any(isinstance(v, list) for v in value)
-            else (" ".join(map(_text, value)) or "none")
+            else (" ".join(map(_text, value)) or str(message("none")))
         )
     if isinstance(value, float):  # large numbers are coordinates, for example of UTM
         return f"{value:.5g}" if abs(value) < 1e5 else f"{value:.12g}"
