@@ -4,23 +4,18 @@ Exit codes: 0 success; 2 an error in the flags or the input, reported as one lin
 130 stopped by Ctrl-C, SIGTERM or SIGHUP, with all finished results saved; 141 the reader of the
 output has closed it. Any other failure is a defect of the program and shows a traceback.
 
-Text for terminals and pipes that cannot show all characters, such as latin-1, ASCII or cp437.
-
-Characters that the encoding of the terminal lacks are replaced by similar ones: "…" by "...", "×"
-by "x", the box of a help text by "+", "-" and "|". Files are not concerned: snowsplat writes all of
-them in UTF-8.
+Characters that the encoding of stdout lacks become "?"; stderr escapes them, so that an error names
+its file. Files are not concerned: snowsplat writes all of them in UTF-8.
 """
 
 from __future__ import annotations
 
-import codecs
 import difflib
 import errno
 import io
 import logging
 import os
 import sys
-import unicodedata
 import warnings
 from collections.abc import Sequence
 from contextlib import redirect_stderr, suppress
@@ -43,9 +38,6 @@ from snowsplat.util.safe_json import printable
 if TYPE_CHECKING:
     from snowsplat.cli.command import Command
 
-# Former names of subcommands, still accepted but not listed.
-_FORMER_NAMES = {"capture": "sfm"}
-
 _REMEDIES = {
     errno.EACCES: message("check the owner and the permissions, or use another folder"),
     errno.EROFS: message("write the result to another folder"),
@@ -54,39 +46,6 @@ _REMEDIES = {
 _OUT_OF_MEMORY = message(
     "out of memory; train with --memory and a smaller number, or use smaller photos, -r 2"
 )
-_ERRORS = "snowsplat-similar"  # the name of the error handler
-_SIMILAR = {
-    **dict.fromkeys("–—‐‑‒−─━╌┄", "-"),
-    **dict.fromkeys("│┃║╎┆", "|"),
-    **dict.fromkeys("╭╮╰╯┌┐└┘├┤┬┴┼╔╗╚╝", "+"),
-    **dict.fromkeys("‘’′", "'"),
-    **dict.fromkeys("“”″„«»", '"'),
-    **dict.fromkeys("·•∙●", "*"),
-    **dict.fromkeys("█▇▆▅▉▊▓", "#"),
-    **dict.fromkeys("▄▃▂▁▋▌▍▎▏▒░", "-"),
-    "×": "x",
-    "±": "+/-",
-    "≤": "<=",
-    "≥": ">=",
-    "≈": "~",
-    "≠": "!=",
-    "∞": "inf",
-    "√": "sqrt",
-    "→": "->",
-    "←": "<-",
-    "↔": "<->",
-    "↑": "^",
-    "↓": "v",
-    "✓": "ok",
-    "✗": "x",
-    "⚠": "!",
-    "°": " deg",
-    "µ": "u",
-    "σ": "sigma",
-    "Σ": "Sigma",
-    "α": "alpha",
-    "λ": "lambda",
-}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -143,7 +102,6 @@ def parse(arguments: Sequence[str]) -> Command:
     """
     name, *rest = arguments
     import_own_files(_imports(rest))
-    name = _FORMER_NAMES.get(name, name)
     if name not in SUBCOMMANDS and not name.startswith("-"):
         raise UserError(_unknown_subcommand(name))
     rest, notes = translated(name, rest)
@@ -184,18 +142,18 @@ def _imports(words: Sequence[str]) -> list[str]:
 
 def _with_flags(message: str, arguments: Sequence[str]) -> str:
     """A message with the flags of the subcommand that was called."""
-    name = _FORMER_NAMES.get(arguments[0], arguments[0])
+    name = arguments[0]
     return with_flags(message, load_subcommand(name) if name in SUBCOMMANDS else None)
 
 
 def _unknown_subcommand(name: str) -> Message:
-    similar = difflib.get_close_matches(name, [*SUBCOMMANDS, *_FORMER_NAMES], 1)
+    similar = difflib.get_close_matches(name, [*SUBCOMMANDS], 1)
     hint: Message | str | None = advice(name)
     if hint is None and os.path.exists(name):
         make = next_step(message("to make a scene"), "make", name)
         hint = message("{make}; {info}", make=make, info=next_step(message("or"), "info", name))
     elif hint is None and similar:
-        hint = message("did you mean {name}?", name=_FORMER_NAMES.get(similar[0], similar[0]))
+        hint = message("did you mean {name}?", name=similar[0])
     elif hint is None:
         hint = message("choose from {names}", names=[*SUBCOMMANDS])
     return message(
@@ -249,28 +207,8 @@ def _report_log_and_warnings_as_lines() -> None:
 
 
 def accept_all_characters() -> None:
-    """Make stdout and stderr replace the characters that their encoding lacks."""
-    codecs.register_error(_ERRORS, _replace)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # not in all notebooks; None without a terminal
-            # Python looks for the position in a file, which a redirected stream may not have.
-            with suppress(OSError):
-                stream.reconfigure(errors=_ERRORS)
-
-
-def similar(character: str) -> str:
-    """``character`` in ASCII; it is escaped, as in ``\\u672c``, if no other is similar."""
-    if character in _SIMILAR:
-        return _SIMILAR[character]
-    if not unicodedata.category(character).startswith("L"):  # "½" -> "1/2", "²" -> "2"
-        plain = unicodedata.normalize("NFKD", character).replace("\N{FRACTION SLASH}", "/")
-        if plain.isascii():
-            return plain
-    # Letters are mostly those of a file name, which must not become the name of another file.
-    return character.encode("ascii", "backslashreplace").decode("ascii")
-
-
-def _replace(error: UnicodeError) -> tuple[str, int]:
-    if not isinstance(error, UnicodeEncodeError):
-        raise error
-    return "".join(map(similar, error.object[error.start : error.end])), error.end
+    """Make stdout replace the characters that its encoding lacks, as stderr does."""
+    if isinstance(sys.stdout, TextIOWrapper):  # not in all notebooks; None without a terminal
+        # Python looks for the position in a file, which a redirected stream may not have.
+        with suppress(OSError):
+            sys.stdout.reconfigure(errors="replace")

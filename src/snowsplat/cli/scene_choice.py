@@ -32,7 +32,7 @@ class SceneChoice(Settings):
         aliases=("-m", "-o"),
     )
     iteration: int | None = common.iteration()
-    dataset: Path | None = common.dataset("--source-path", "--capture")
+    dataset: Path | None = common.dataset("--source-path")
     resolution: int | None = common.resolution("as trained")
     compute: Compute = group(Compute, only=("device", "threads"))
 
