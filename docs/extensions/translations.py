@@ -28,6 +28,7 @@ _DOCS = Path(__file__).resolve().parents[1]
 TRANSLATED = (
     "installation.md",
     "quick-start.md",
+    "guides/anamorph.md",
     "guides/globe.md",
     "guides/gpu.md",
     "guides/images-and-videos.md",

@@ -21,6 +21,8 @@ from snowsplat.training.core import checkpoint
 
 from ..fork_server import ENVIRONMENT
 
+#: Subcommands that do not have their own file in `cli`.
+OTHERS = ("demo", "lift", "image", "globe", "anamorph")
 UNIT_BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
 
 
@@ -128,7 +130,7 @@ def test_the_help_of_no_subcommand_imports_torch():
     names = list(module.SUBCOMMANDS)
     for name, imported in zip(names, imported_by(*([n, "--help"] for n in names)), strict=True):
         file = "mesh" if name == "points" else name
-        assert imported == {f"snowsplat.cli.{file}"} or name in ("demo", "lift", "image", "globe")
+        assert imported == {f"snowsplat.cli.{file}"} or name in OTHERS
         assert not {"torch", "numpy", "PIL"} & imported, name
 
 

@@ -20,6 +20,9 @@ def register() -> None:
         "PHOTO --depth MAP -o OUT", "one photo and its depth -> a scene", _lift
     )
     SUBCOMMANDS["image"] = Subcommand("PHOTO -o OUT", "a photo as 1000 Gaussians", _image)
+    SUBCOMMANDS["anamorph"] = Subcommand(
+        "A B [C] -o OUT", "another picture from each side", _anamorph
+    )
     SUBCOMMANDS["globe"] = Subcommand("SCENE", "a snow globe, as a web page", _globe)
 
 
@@ -33,6 +36,12 @@ def _image() -> type[Command]:
     from snowsplat.extras.image.command import Image
 
     return Image
+
+
+def _anamorph() -> type[Command]:
+    from snowsplat.extras.anamorph.command import Anamorph
+
+    return Anamorph
 
 
 def _globe() -> type[Command]:

@@ -1,0 +1,1 @@
+"""`snowsplat anamorph`: Gaussians that show another picture from each side."""
