@@ -113,33 +113,3 @@ def test_focal_lengths_of_a_bent_model_are_found_with_separate_cameras(
     job.attempts[0].models = ["a model"]
     job._try_zooms()
     assert found == [way]
-
-
-@pytest.mark.parametrize(
-    ("same", "flat", "agreement", "kept"),
-    [
-        (True, True, 0.99, True),
-        (False, True, 0.8, False),  # before a plane, the matches cannot tell
-        (False, False, 0.99, False),
-        (False, False, 0.8, True),  # the model that was made before is bent
-    ],
-)
-def test_the_model_of_another_mapper_must_have_the_poses_of_a_good_one(
-    job, monkeypatch, same, flat, agreement, kept
-):
-    job.evidence.flat, job.mapper, job.lens, job.matched = flat, "incremental", Lens(), None
-    first, other = (attempt(6, agreement) for _ in range(2))
-    first.models, other.models, other.description = [object()], [object()], "global mapping"
-    job.attempts = [first]
-    used = []
-
-    def run(how, matched, mapper, lens):
-        used.append(mapper)
-        return other
-
-    monkeypatch.setattr(job.runner, "run", run)
-    monkeypatch.setattr(reconstruct, "have_same_poses", lambda one, two: same)
-    job._try_other_mapper()
-    assert used == ["global"]
-    assert (other in job.attempts) == kept
-    assert ("not used" in job.log[-1]) == (not kept)

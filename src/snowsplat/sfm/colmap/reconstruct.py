@@ -29,7 +29,7 @@ from snowsplat.sfm.colmap.attempt import Attempt, AttemptRunner, Matched
 from snowsplat.sfm.colmap.checks.consistency import CONSISTENT
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
 from snowsplat.sfm.colmap.checks.matches import PairMatches, read_matches
-from snowsplat.sfm.colmap.checks.score import Score, have_same_poses, score_of
+from snowsplat.sfm.colmap.checks.score import Score, score_of
 from snowsplat.sfm.colmap.database import (
     copy_without_verification,
     remove_database,
@@ -217,17 +217,7 @@ class PoseEstimation:
         self._try(mapper="incremental", lens=replace(self.lens, held=True))
 
     def _try_other_mapper(self) -> None:
-        """A wrong model may agree with the matches better than a right one: before a plane, and
-        where photos of one half of a model have few matches with the other half. So two mappers
-        must agree on the photos of which both have poses; else the model that was made before is
-        kept, if it agrees with its matches, or if the matches cannot tell."""
-        before = self._best()
-        made = self._try(mapper="incremental" if self.mapper == "global" else "global")
-        if not (made.models and before.models) or have_same_poses(made.models[0], before.models[0]):
-            return
-        if self.evidence.flat or before.agreement >= CONSISTENT:
-            self.attempts.remove(made)
-            self.log[-1] += "; not used: its poses are not those of the attempts before"
+        self._try(mapper="incremental" if self.mapper == "global" else "global")
 
     def _match_first(self, effort: Effort) -> None:
         """The matches and the lens of the first attempt."""

@@ -12,7 +12,7 @@ from snowsplat.sfm.colmap.checks.consistency import (
     CheckedPair,
     agreement_of,
 )
-from snowsplat.sfm.colmap.checks.parts import find_parts, unconfirmed_photos
+from snowsplat.sfm.colmap.checks.parts import find_parts
 
 
 def chain(photos, share=0.7, matches=400, neighbours=3):
@@ -147,17 +147,6 @@ def test_tears_of_every_second_photo_cut_nothing():
     # Where the walk is torn, the pairs across the tear still count.
     broken = [replace(p, hits=0) if (p.first, p.second) == (20, 21) else p for p in pairs]
     assert find_parts(broken) == [set(range(1, 21)), set(range(21, 31))]
-
-
-def test_a_photo_that_no_other_photo_confirms():
-    def pairs(best, tears):
-        of_photo = [CheckedPair(i, 31, 300, 10) for i in range(1, 1 + tears)]
-        return [*chain(range(1, 31)), *of_photo, replace(chain([30, 31])[0], miss_share=best)]
-
-    assert unconfirmed_photos(pairs(best=0.3, tears=3)) == {31}
-    assert unconfirmed_photos(pairs(best=0.3, tears=2)) == set()
-    assert unconfirmed_photos(pairs(best=0.1, tears=3)) == set()
-    assert unconfirmed_photos([]) == set()
 
 
 def test_little_evidence_cuts_nothing():

@@ -191,33 +191,6 @@ def test_a_photo_may_be_in_a_later_model_only(mapping, scene, monkeypatch, tmp_p
     assert f"{look_alikes.COUNT - 1:02}.png" in repaired.excluded
 
 
-def test_a_photo_that_no_other_photo_confirms_is_left_out(mapping, scene, monkeypatch):
-    """It has three tears and no confirmed pair. But its strongest pair supports its pose."""
-    last = look_alikes.COUNT
-
-    def doubtful(model, database, max_error):
-        pairs = check_pairs(model, database, max_error)
-        others = [pair for pair in pairs if pair.second != last]
-        return [
-            *others,
-            *(CheckedPair(i, last, 200, 0) for i in range(last - 4, last - 1)),
-            CheckedPair(last - 1, last, 400, 200, miss_share=0.2, follows=True),
-        ]
-
-    model = look_alikes.model(scene, folded=False)
-    monkeypatch.setattr("snowsplat.sfm.colmap.checks.repair.check_pairs", doubtful)
-    repaired = repair(model, mapping, 4.0)
-    assert {photo: str(why) for photo, why in repaired.excluded.items()} == {
-        f"{last - 1}.png": "no other photo confirms its place: 4 photos have matches with it, and "
-        f"at best 71% of the matches agree with its pose ({last - 2}.png)"
-    }
-    assert set(repaired.model.reg_image_ids()) == set(range(1, last))
-    assert (
-        repaired.description
-        == "the poses of 1 contradicted their matches: 0 registered again, 1 left out"
-    )
-
-
 def test_the_model_with_the_most_photos_is_used(mapping, scene, monkeypatch, made_anew):
     """A model made again may have fewer photos than the first one without its wrong photos."""
     few = look_alikes.COUNT - len(FAR) - 1

@@ -7,16 +7,13 @@ import pycolmap
 import pytest
 
 from snowsplat.sfm.colmap.checks.matches import PairMatches, read_matches
-from snowsplat.sfm.colmap.checks.score import have_same_poses, score_of
+from snowsplat.sfm.colmap.checks.score import score_of
 from snowsplat.sfm.colmap.lenses.prior import log_prior
 
 from .. import look_alikes
 
 WIDTH, HEIGHT, FOCAL = 1600, 1200, 1280.0
 PHOTOS = 10
-TURNS = [
-    pycolmap.Rigid3d(pycolmap.Rotation3d([0, 0.01 * (i % 2), 0]), [0, 0, 0]) for i in range(10)
-]
 
 
 def turned(angle, axis=(0, 1, 0)):
@@ -154,19 +151,3 @@ def test_a_walk_past_two_places_that_look_alike_is_not_folded(tmp_path):
     pairs = read_matches(look_alikes.write_database(tmp_path / "database.db", scene))
     true, folded = (score_of(look_alikes.model(scene, fold), pairs, {}) for fold in (False, True))
     assert true.total > folded.total + 1000
-
-
-@pytest.mark.parametrize(
-    ("other", "same"),
-    [
-        (lambda: model_of(poses()), True),
-        (lambda: model_of([turn * pose for turn, pose in zip(TURNS, poses(), strict=True)]), True),
-        (lambda: model_of(bent()), False),
-        (lambda: model_of(poses(), without=range(3, PHOTOS)), True),  # too few in common
-    ],
-    ids=["same", "inexact", "bent", "two photos"],
-)
-def test_models_with_the_same_poses_differ_by_the_frame_of_the_world(other, same):
-    model = other()
-    model.transform(pycolmap.Sim3d(2.5, turned(0.7, (1, 0, 0)), [3, -2, 1]))
-    assert have_same_poses(model_of(poses()), model) == same

@@ -7,7 +7,6 @@ maximum spanning tree of the view graph, but those that contradict each other ar
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,21 +26,6 @@ from snowsplat.sfm.colmap.checks.matches import Ints
 _MAX_SUPPORT = 0.5
 _MIN_TEARS = 3
 _MIN_FOLLOWING_TEARS = 2
-
-
-def unconfirmed_photos(pairs: Sequence[CheckedPair]) -> set[int]:
-    """The photos (image ids) whose pose is doubtful, although no part contradicts another one.
-
-    Such a photo has at least `_MIN_TEARS` tears, but no pair that the model confirms. In a correct
-    model, every photo is confirmed by others, even if most of its matches are false.
-    """
-    tears: Counter[int] = Counter()
-    confirmed: set[int] = set()
-    for pair in pairs:
-        tears.update({pair.first: int(pair.torn), pair.second: int(pair.torn)})
-        if pair.counts and pair.confirmed:
-            confirmed |= {pair.first, pair.second}
-    return {photo for photo, count in tears.items() if count >= _MIN_TEARS} - confirmed
 
 
 def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:

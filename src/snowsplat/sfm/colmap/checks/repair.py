@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import pycolmap
@@ -14,7 +14,8 @@ from snowsplat.sfm.colmap.checks.consistency import (
     agreement_of,
     check_pairs,
 )
-from snowsplat.sfm.colmap.checks.parts import find_parts, unconfirmed_photos
+from snowsplat.sfm.colmap.checks.parts import find_parts
+from snowsplat.sfm.colmap.checks.undetermined import undetermined_photos
 from snowsplat.sfm.colmap.database import copy_for_mapping, remove_database
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
 from snowsplat.sfm.options import MIN_PHOTOS
@@ -29,18 +30,22 @@ class Repaired:
 
     model: pycolmap.Reconstruction
     contradicting: int  # number of photos whose pose contradicted their matches
+    undetermined: int  # number of photos that are excluded as their position is not determined
     excluded: dict[str, Message]  # name -> reason, for those of these photos that have no pose now
 
     @property
     def description(self) -> str:
         """What the check found, as text; empty if it found nothing."""
-        if not self.contradicting:
-            return ""
-        again = self.contradicting - len(self.excluded)
-        return (
-            f"the poses of {self.contradicting} contradicted their matches: {again} registered "
-            f"again, {len(self.excluded)} left out"
-        )
+        texts = []
+        if self.contradicting:
+            again = self.contradicting - (len(self.excluded) - self.undetermined)
+            texts = [
+                f"the poses of {self.contradicting} contradicted their matches: {again} registered "
+                f"again, {self.contradicting - again} left out"
+            ]
+        if self.undetermined:
+            texts.append(f"{self.undetermined} left out, as their positions are not determined")
+        return "; ".join(texts)
 
 
 def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -> Repaired:
@@ -57,10 +62,10 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
       also bent the first part of the model. This is repeated until no part contradicts the others,
       at most `_ROUNDS` times.
 
-    Of all models, the one with the most photos is used. Its photos that contradict the others, or
-    that no other photo confirms, are left out.
+    Of all models, the one with the most photos is used. Its photos that contradict the others are
+    left out, and so are those whose positions the points do not determine.
 
-    A model without contradictions is returned unchanged. ``max_error`` as in `check_pairs`.
+    A model without such photos is returned unchanged. ``max_error`` as in `check_pairs`.
     """
     names: dict[int, str] = {}  # image id -> file name
     # The image ids of the pairs with false matches, of all rounds.
@@ -71,9 +76,8 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         names |= {i: image.name for i, image in model.images.items()}
         pairs = check_pairs(model, mapping.database, max_error)
         parts = _parts(pairs, false_pairs)
-        doubtful = unconfirmed_photos(pairs).difference(*parts[1:])
-        found.append((model, doubtful.union(*parts[1:])))
-        wrong |= _doubts(model, pairs, doubtful) | _reasons(model, pairs, parts)
+        found.append((model, set[int]().union(*parts[1:])))
+        wrong |= _reasons(model, pairs, parts)
         if len(parts) < 2:
             break
         models = _registered_again(model, mapping, parts, max_error) if len(found) == 1 else []
@@ -86,9 +90,31 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     model, excluded = max(reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1]))
     if excluded:
         model = mapping.without(model, excluded)
+    model, undetermined = _without_undetermined(model, mapping)
     registered = set(model.reg_image_ids())
-    reasons = {names[i]: reason for i, reason in wrong.items() if i not in registered}
-    return Repaired(model, len(wrong), reasons)
+    left_out = {i: reason for i, reason in wrong.items() if i not in registered} | undetermined
+    reasons = {names[i]: reason for i, reason in left_out.items()}
+    return Repaired(model, len(wrong.keys() - undetermined.keys()), len(undetermined), reasons)
+
+
+def _without_undetermined(
+    model: pycolmap.Reconstruction, mapping: Mapping
+) -> tuple[pycolmap.Reconstruction, dict[int, Message]]:
+    """``model`` without its `undetermined_photos`; and why: image id -> reason.
+
+    They are not registered again: the matches with the others are too few for a pose. (Measured in
+    a capture with two such groups, also with weaker matches: no photo could be.)
+    """
+    reasons: dict[int, Message] = {}
+    while found := undetermined_photos(model):
+        for photo, error in found.items():
+            reasons[photo] = message(
+                "its position is not determined, with an error of {error:,.0f} times the extent of "
+                "the other photos: it has too few points in common with them",
+                error=error,
+            )
+        model = mapping.without(model, found)
+    return model, reasons
 
 
 def _parts(pairs: Sequence[CheckedPair], false_pairs: set[tuple[int, int]]) -> list[set[int]]:
@@ -157,24 +183,6 @@ def _false_pairs(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set
         if part.get(pair.first, 0) != part.get(pair.second, 0)
         and not (pair.contradicted or pair.follows)
     }
-
-
-def _doubts(
-    model: pycolmap.Reconstruction, pairs: Sequence[CheckedPair], photos: Collection[int]
-) -> dict[int, Message]:
-    """Why ``photos``, those of `unconfirmed_photos`, have a doubtful pose: image id -> text."""
-    reasons = {}
-    for photo in sorted(photos):
-        own = [pair for pair in pairs if pair.counts and photo in (pair.first, pair.second)]
-        best = max(own, key=lambda pair: pair.support)
-        reasons[photo] = message(
-            "no other photo confirms its place: {count} photos have matches with it, and at best "
-            "{share:.0%} of the matches agree with its pose ({other})",
-            count=len(own),
-            share=best.support,
-            other=model.image(best.other(photo)).name,
-        )
-    return reasons
 
 
 def _reasons(

@@ -40,12 +40,6 @@ from snowsplat.sfm.colmap.checks.matches import PairMatches
 from snowsplat.sfm.colmap.lenses.lens import used_cameras
 from snowsplat.sfm.colmap.lenses.posterior import OVERDISPERSION
 from snowsplat.sfm.colmap.lenses.prior import log_prior
-from snowsplat.sfm.options import MIN_PHOTOS
-
-# Degrees, between the models of two mappers. Measured: at most 0.41 in 65 pairs of right models of
-# eight captures, and 1.2 and 2.7 where one of them is wrong: a shiny object in a blurred room and
-# on a carpet. Formal errors do not tell: right models are 15 to 400 of them apart.
-_SAME_ROTATION = 0.7
 
 
 @dataclass(frozen=True)
@@ -93,19 +87,3 @@ def score_of(
         return Score(0.0, lenses, complexity, LEAST_NOISE, LEAST_FALSE, 0.0)
     value, noise, false, true = likelihood(np.concatenate(distances), np.concatenate(sides))
     return Score(value, lenses, complexity, noise, false, true / everything)
-
-
-def have_same_poses(one: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> bool:
-    """Whether the photos of both models have the same rotations, except for that of the world: the
-    median of the angles between them is at most `_SAME_ROTATION`. True if these are too few."""
-    common = sorted(set(one.reg_image_ids()) & set(other.reg_image_ids()))
-    if len(common) < MIN_PHOTOS:
-        return True
-    a, b = (
-        np.array([model.image(i).cam_from_world().rotation.matrix() for i in common])
-        for model in (one, other)
-    )
-    left, _, right = np.linalg.svd(np.einsum("nji,njk->ik", a, b))
-    world = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    cosine = (np.einsum("nij,jk,nik->n", a, world, b) - 1) / 2
-    return float(np.median(np.arccos(cosine.clip(-1, 1)))) <= math.radians(_SAME_ROTATION)

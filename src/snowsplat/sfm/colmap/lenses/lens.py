@@ -82,11 +82,6 @@ class Lens:
         return bool(self.fisheyes) or is_fisheye(self.model)
 
     @property
-    def fixed(self) -> Lens:
-        """The same with a held focal length, for photos that do not determine it."""
-        return replace(self, held=True)
-
-    @property
     def detailed(self) -> list[str]:
         """The camera models that `settle_lens` tries, the one with the most parameters first."""
         return ["auto", "SIMPLE_RADIAL", "SIMPLE_PINHOLE"] if self.model == "auto" else [self.model]
