@@ -34,16 +34,25 @@ Trainer.step_once = killed
 """
 
 
+#: In place of matplotlib, which is no requirement.
+PLOTS = (
+    "import sys; from unittest.mock import MagicMock as M; p = M();"
+    "p.subplots = lambda: (M(), M());"
+    "sys.modules |= {'matplotlib': M(pyplot=p), 'matplotlib.pyplot': p}"
+)
+
+
 def quick(block: str) -> str:
     """The example with fewer steps, and a checkpoint after step 25."""
     block = block.replace('"iterations": 300', '"iterations": 50')
     block = block.replace("iterations=300", "iterations=50").replace("range(100)", "range(5)")
+    block = block.replace("(100, 200)", "(10, 30)")
     return block.replace('"checkpoint_every": 50', '"checkpoint_every": 25')
 
 
 def executed(code: str, folder: Path) -> tuple[int, str, str]:
     (folder / "example.py").write_text(code)
-    inside = f"import os, runpy; os.chdir({str(folder)!r}); runpy.run_path('example.py')"
+    inside = f"{PLOTS}; import os, runpy; os.chdir({str(folder)!r}); runpy.run_path('example.py')"
     done = run("-c", inside, env={**ENVIRONMENT, "OMP_NUM_THREADS": "1"})
     return done.returncode, done.stdout, done.stderr
 

@@ -137,7 +137,7 @@ def test_an_existing_file(run, refused, ply, tmp_path):
 def test_invalid_input(refused, ply, tmp_path):
     out = tmp_path / "b.ply"
     assert "name of a file" in refused("convert", ply)
-    assert "selects no scene format" in refused("convert", ply, tmp_path / "b.obj")
+    assert "use snowsplat mesh" in refused("convert", ply, tmp_path / "b.obj")
     assert "selects no scene format" in refused("convert", ply, tmp_path / "b.ksplat")
     assert "no such file" in refused("convert", tmp_path / "absent.ply", out)
     assert "is a folder" in refused("convert", ply, tmp_path)

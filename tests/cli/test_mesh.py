@@ -3,10 +3,12 @@
 import json
 import struct
 import sys
+import zipfile
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from snowsplat.formats import mesh_files
 from snowsplat.scene.mesh import Mesh
@@ -48,7 +50,8 @@ def test_errors_are_one_line(refused, out, tmp_path, monkeypatch):
     monkeypatch.setattr("snowsplat.formats.mesh_files.find_spec", lambda name: None)
     for arguments, message in (
         (("mesh",), "-o"),
-        (("mesh", out, "-o", tmp_path / "a.stl"), "use .ply, .glb or .obj"),
+        (("mesh", out, "-o", tmp_path / "a.stl"), "use .ply, .glb, .obj or .usdz"),
+        (("mesh", out, "-o", tmp_path / "a.usdz"), "pip install 'snowsplat[usd]'"),
         (("points", out, "-o", tmp_path / "a.laz"), "pip install 'snowsplat[mesh]'"),
         (("mesh", out, "-o", tmp_path / "a.ply", "--triangles", "9"), "fast-simplification"),
         (("mesh", out, "-o", tmp_path / "a.ply", "--voxel", "-1"), "--voxel"),
@@ -103,6 +106,36 @@ def test_glb_follows_the_rules(tmp_path):
     normals = np.frombuffer(binary, "<f4", 12, document["bufferViews"][1]["byteOffset"])
     assert np.allclose(np.linalg.norm(normals.reshape(4, 3), axis=1), 1)
     assert document["buffers"][0]["byteLength"] == len(binary)
+
+
+@pytest.mark.parametrize(("metres", "unit"), [(None, 0.3), (0.5, 0.5)])
+def test_usdz_for_phones(tmp_path, metres, unit):
+    """OpenUSD finds nothing to complain about, and the texture has the colours of the corners."""
+    Usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom, UsdShade, UsdValidation
+
+    path = tmp_path / "a.usdz"
+    mesh = _tetrahedron(up=(0.0, 0.0, 1.0), metres_per_unit=metres)
+    mesh_files.write_mesh(path, mesh, [])
+    assert [file.name for file in tmp_path.iterdir()] == ["a.usdz"]
+    stage = Usd.Stage.Open(str(path))
+    known = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    errors = UsdValidation.ValidationContext(known).Validate(stage)
+    assert [error.GetMessage() for error in errors] == []
+    assert np.isclose(UsdGeom.GetStageMetersPerUnit(stage), unit)  # 2 units are 0.6 m wide
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/scene/mesh"))
+    box = UsdGeom.BBoxCache(0, ["default"]).ComputeWorldBound(shape.GetPrim()).ComputeAlignedRange()
+    assert np.allclose(box.GetMin(), (-0.5, 0, -1)), box
+    assert np.allclose(box.GetMax(), (0.5, 3, 1)), box
+    texture = UsdShade.Shader(stage.GetPrimAtPath("/scene/material/texture"))
+    with zipfile.ZipFile(path) as files:
+        pixels = np.array(
+            Image.open(files.open(texture.GetInput("file").Get().path.removeprefix("./")))
+        )
+    corners = np.array(UsdGeom.PrimvarsAPI(shape).GetPrimvar("st").Get()) * len(pixels)
+    column, row = corners[:, 0].astype(int), (len(pixels) - corners[:, 1]).astype(int)
+    rows = np.array(shape.GetFaceVertexIndicesAttr().Get())
+    assert np.array_equal(pixels[row, column], mesh.colors[rows])
 
 
 def test_las_in_laspy(tmp_path):

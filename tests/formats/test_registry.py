@@ -77,6 +77,9 @@ def test_unknown_formats_are_one_line_errors(tmp_path):
     with pytest.raises(UserError, match=r"not a known scene file; supported are .*\.ply") as error:
         read_gaussians(path)
     assert "\n" not in str(error.value)
+    with pytest.raises(UserError, match="use snowsplat mesh or snowsplat points"):
+        write_gaussians(path, one())
+    path = tmp_path / "scene.txt"
     with pytest.raises(UserError, match=r"selects no scene format; use one of .*\.ply"):
         write_gaussians(path, one())
     with pytest.raises(UserError, match="cannot be read"):

@@ -89,7 +89,7 @@ def test_from_photos_to_a_file(studio, forked, tmp_path, monkeypatch):
         click(page, "ZIP")
         page.wait_for("!document.querySelector('.export button:disabled')", 60)
         assert "index.html" in zipfile.ZipFile(scene.exports / "My tour.zip").namelist()
-        click(page, "MESH")
+        click(page, "glTF (mesh)")
         page.wait_for("!document.querySelector('.export button:disabled')", 60)
         assert (scene.exports / "My tour_mesh.glb").read_bytes()[:4] == b"glTF"
         asked |= set(

@@ -87,6 +87,7 @@ class Mesh(SurfaceCommand):
       The suffix of FILE selects the format:
         .glb   for Blender, games and the web; y is up
         .obj   for most other programs; y is up
+        .usdz  for augmented reality on an iPhone or iPad (snowsplat[usd]); y is up
         .ply   for MeshLab and CloudCompare; in the frame of the scene
       Lengths are in the units of the dataset: metres if it has the true scale.
       --triangles needs a package: pip install 'snowsplat[mesh]'

@@ -1,7 +1,7 @@
-"""Files of meshes and point clouds: PLY, GLB, OBJ, LAS and LAZ.
+"""Files of meshes and point clouds: PLY, GLB, OBJ, USDZ, LAS and LAZ.
 
-PLY and LAS keep the frame of the scene. In GLB and OBJ, y is up, as other programs expect it of
-these formats.
+PLY and LAS keep the frame of the scene. In GLB, OBJ and USDZ, y is up, as other programs expect it
+of these formats.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from snowsplat.formats import glb
+from snowsplat.formats import glb, mesh_usdz
 from snowsplat.scene.mesh import Mesh, y_up
 from snowsplat.scene.origin import HERE
 from snowsplat.util.errors import UserError
@@ -20,8 +20,10 @@ from snowsplat.util.files import atomic_path
 from snowsplat.util.ply import header_of
 from snowsplat.util.srgb import to_linear
 
-MESH_SUFFIXES = (".ply", ".glb", ".obj")
+MESH_SUFFIXES = (".ply", ".glb", ".obj", ".usdz")
 POINTS_SUFFIXES = (".ply", ".las", ".laz")
+#: What the suffixes need, by the names of modules.
+_PACKAGES = {".las": ("laspy",), ".laz": ("laspy", "lazrs"), ".usdz": ("pxr",)}
 _GLB_LIMIT = (1 << 32) - (1 << 20)
 _OBJ_ROWS = 1 << 16
 
@@ -36,12 +38,14 @@ def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
             suffixes=", ".join(suffixes[:-1]),
             suffixes2=suffixes[-1],
         )
-    for package in {".las": ("laspy",), ".laz": ("laspy", "lazrs")}.get(suffix, ()):
+    for package in _PACKAGES.get(suffix, ()):
         if find_spec(package) is None:
             raise UserError(
-                "{suffix} needs the package {package}: pip install 'snowsplat[mesh]'; or use .ply",
+                "{suffix} needs the package {package}: pip install 'snowsplat[{extra}]'; or use "
+                ".ply",
                 suffix=suffix,
                 package=package,
+                extra="usd" if suffix == ".usdz" else "mesh",
             )
 
 
@@ -54,6 +58,9 @@ def write_mesh(path: Path, mesh: Mesh, comments: list[str]) -> None:
         UserError: an unknown suffix, or a mesh too large for the format.
         OSError: the folder is missing or not writable, or the disk is full.
     """
+    if path.suffix.lower() == ".usdz":
+        mesh_usdz.write_usdz(path, mesh)
+        return
     write = {".ply": _write_ply, ".glb": _write_glb, ".obj": _write_obj}.get(path.suffix.lower())
     if write is None:
         check_suffix(path, POINTS_SUFFIXES)

@@ -72,6 +72,8 @@ class Format:
         return self.bytes(path) if self.bytes else path.stat().st_size
 
 
+#: Suffixes of formats that hold no Gaussians.
+_SURFACES = (".obj", ".stl", ".fbx", ".dae", ".3mf", ".las", ".laz", ".e57")
 _UNMARKED = message("the antialiased mark")
 _ROUNDED = message("nothing except for rounding and the antialiased mark")
 
@@ -248,6 +250,12 @@ def format_for_writing(path: Path | str) -> Format:
     path = Path(path)
     writable = [format for format in FORMATS if format.write is not None]
     format = _by_suffix(path, writable)
+    if format is None and path.suffix.lower() in _SURFACES:
+        raise UserError(
+            "{path}: is a format of triangles or points, not of Gaussians; use snowsplat mesh or "
+            "snowsplat points",
+            path=path,
+        )
     if format is None:
         raise UserError(
             "{path}: the suffix selects no scene format; use one of {suffixes}",

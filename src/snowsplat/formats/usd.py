@@ -63,7 +63,7 @@ def is_usd(head: bytes) -> bool:
 
 
 @contextmanager
-def _usd(path: Path) -> Iterator[tuple[Any, ...]]:
+def open_usd(path: Path) -> Iterator[tuple[Any, ...]]:
     """Usd, UsdGeom, UsdUtils, UsdVol, Sdf and Vt of OpenUSD.
 
     Raises: UserError: they are not installed, or OpenUSD reports an error.
@@ -96,7 +96,7 @@ def read_usd(path: Path) -> GaussianArrays:
     Raises: UserError: usd-core is missing; the file cannot be read, is damaged, or has no splats.
     """
     path.open("rb").close()  # a clear error if that is not possible
-    with _usd(path):
+    with open_usd(path):
         check_readable(prims_with_splats, path, _LIBRARIES)
     prims = prims_with_splats(path)
     notes = Counter(note for prim in prims for note in prim.notes)
@@ -115,7 +115,7 @@ def read_usd(path: Path) -> GaussianArrays:
 @reads
 def prims_with_splats(path: Path) -> list[_Prim]:
     """The prims with splats in a file. Raises: as `read_usd`."""
-    with _usd(path) as (Usd, UsdGeom, _, UsdVol, _, _):
+    with open_usd(path) as (Usd, UsdGeom, _, UsdVol, _, _):
         stage = Usd.Stage.Open(str(path))
         # A stage whose unit is one metre says nothing: programs that do not know the unit write it.
         unit = UsdGeom.GetStageMetersPerUnit(stage)
@@ -233,7 +233,7 @@ def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
     means, quats = scene.means, scene.quats
     cut = packing.Cut(path, "USD", len(means))
     scales, opacities, sh = packing.linear_values(cut, scene)
-    with _usd(path) as (Usd, UsdGeom, UsdUtils, UsdVol, Sdf, Vt):
+    with open_usd(path) as (Usd, UsdGeom, UsdUtils, UsdVol, Sdf, Vt):
         kind = path.suffix.lower()
         layer = Sdf.Layer.CreateAnonymous(".usda" if kind == ".usda" else ".usdc")
         stage = Usd.Stage.Open(layer)

@@ -115,8 +115,8 @@ def write_mesh(
     Args:
         load: loads the scene with its dataset, as `load_trained`; called after the other
             arguments have been checked.
-        target: .ply, .glb or .obj; with ``points``, .ply, .las or .laz, of which the last two need
-            the packages laspy and lazrs. Its folder is created if it does not exist.
+        target: .ply, .glb, .obj or .usdz; with ``points``, .ply, .las or .laz. The last of each
+            need packages. Its folder is created if it does not exist.
         overwrite: replace ``target``.
         observer: gets the stages "reading", "depth", "stereo", "fusion", "triangles" and
             "colours".
@@ -173,7 +173,8 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
     normals = vertex_normals(vertices, faces)
     poses = torch.stack([view.camera.cam_from_world[:, :3] for view in views])
     x, y, z = scene_up(poses.detach().double().cpu().numpy()).tolist()
-    mesh = Mesh(vertices, faces, normals, colors, scene.dataset.origin, (x, y, z))
+    about = scene.dataset.origin, (x, y, z), scene.gaussians.metres_per_unit
+    mesh = Mesh(vertices, faces, normals, colors, *about)
     return Surface(mesh, len(views), voxel, far, found, closer)
 
 

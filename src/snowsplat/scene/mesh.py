@@ -20,6 +20,7 @@ class Mesh:
         normals: (V, 3) float32, of length 1, outward; 0 where unknown.
         colors: (V, 3) uint8 sRGB.
         up: the direction upwards, of length 1.
+        metres_per_unit: the true scale; None: unknown.
     """
 
     vertices: np.ndarray
@@ -28,6 +29,7 @@ class Mesh:
     colors: np.ndarray
     origin: Origin = HERE
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    metres_per_unit: float | None = None
 
 
 def y_up(up: tuple[float, float, float]) -> np.ndarray:

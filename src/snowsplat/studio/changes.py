@@ -32,7 +32,7 @@ from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project
 from snowsplat.project.site_folder import SiteFolder
 from snowsplat.project.studio_scene import StudioScene
-from snowsplat.studio.hand_on import SURFACES, export_file, is_exported
+from snowsplat.studio.hand_on import SURFACES, export_file, is_exported, mesh_options
 from snowsplat.studio.job import is_being_made
 from snowsplat.studio.library import safe_title
 from snowsplat.util.errors import UserError
@@ -88,7 +88,11 @@ def export(scene: StudioScene, settings: Export) -> dict[str, Any]:
                 shutil.make_archive(str(new / target.stem), "zip", scene.site)
         elif kind in SURFACES:
             write_mesh(
-                lambda: load_trained(scene.made), target, overwrite=True, points=kind == "points"
+                lambda: load_trained(scene.made),
+                target,
+                mesh_options(kind),
+                overwrite=True,
+                points=kind == "points",
             )
         else:
             convert(file, target, overwrite=True)

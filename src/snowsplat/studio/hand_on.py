@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from snowsplat.pipeline.options.make import MakeOptions
+from snowsplat.pipeline.options.scene import MeshOptions
 from snowsplat.pipeline.options.video import VideoOptions
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project
@@ -25,14 +26,17 @@ FORMATS = {
     "zip": ".zip",
     "mesh": "_mesh.glb",
     "points": "_points.ply",
+    "ar": "_ar.usdz",
 }
 #: Kinds that are made from the photos of a training, without the edits of the scene.
-SURFACES = ("mesh", "points")
+SURFACES = ("mesh", "points", "ar")
+#: Of a mesh for phones, if the package that simplifies is installed.
+_AR_TRIANGLES = 100_000
 
 
 def formats_of(scene: StudioScene) -> list[str]:
     """The kinds of `FORMATS` that a scene can be written in."""
-    missing = [] if find_spec("pxr") else ["usdz"]  # an optional package
+    missing = [] if find_spec("pxr") else ["usdz", "ar"]  # an optional package
     if Project.open(scene.made).training is None:
         missing += SURFACES
     return [kind for kind in FORMATS if kind not in missing]
@@ -53,13 +57,22 @@ def is_exported(scene: StudioScene, kind: str) -> bool:
     )
 
 
+def mesh_options(kind: str) -> MeshOptions:
+    """How the surfaces of one of `SURFACES` are made."""
+    if kind == "ar" and find_spec("fast_simplification"):
+        return MeshOptions(triangles=_AR_TRIANGLES)
+    return MeshOptions()
+
+
 def export_command(scene: StudioScene, kind: str) -> str:
     """The command line that writes it."""
     file = scene.scene_file() or scene.made
     if kind == "zip":
         return command_line("publish", [file, "-o", "site"])
     if kind in SURFACES:
-        return command_line(kind, [scene.made, "-o", export_file(scene, kind).name])
+        options = words(MeshOptions, vars(mesh_options(kind)))
+        verb = "points" if kind == "points" else "mesh"
+        return command_line(verb, [scene.made, "-o", export_file(scene, kind).name], options)
     return command_line("convert", [file, export_file(scene, kind).name])
 
 

@@ -8,6 +8,9 @@ import { dressed, say, told } from "./text.js";
 const EMBED =
     '<iframe src="https://example.org/scene/index.html" title="3D scene" allow="fullscreen; xr-spatial-tracking" style="width: 100%; aspect-ratio: 16 / 9; border: 0"></iframe>';
 
+/** What a kind of file is called, if it is not the end of its name. @type {Record<string, string>} */
+const NAMES = { glb: "glTF (splats)", mesh: "glTF (mesh)", usdz: "USDZ (splats)", ar: "USDZ (AR)" };
+
 export function resultPart(
     /** @type {import("./scene.js").ScenePage} */ page,
     /** @type {import("./types.js").Scene} */ scene,
@@ -76,11 +79,8 @@ export function resultPart(
 }
 
 function download(/** @type {string} */ address, /** @type {string} */ kind) {
-    const button = make(
-        "button.plain",
-        { type: "button", "aria-label": say("download_kind", kind.toUpperCase()) },
-        kind.toUpperCase(),
-    );
+    const name = NAMES[kind] ?? kind.toUpperCase();
+    const button = make("button.plain", { type: "button", "aria-label": say("download_kind", name) }, name);
     const about = make("span", {}, say(`kind_${kind}`));
     button.addEventListener(
         "click",

@@ -154,6 +154,10 @@ const TEXTS = {
         "三角形表面（glTF），适合 Blender 和游戏；不含编辑",
     ],
     kind_points: ["A dense cloud of points (PLY); without edits", "稠密点云（PLY）；不含编辑"],
+    kind_ar: [
+        "Surfaces for augmented reality (USDZ) on an iPhone or iPad; without edits",
+        "用于 iPhone 和 iPad 增强现实的表面（USDZ）；不含编辑",
+    ],
     kind_html: ["One page with a viewer", "带查看器的单个网页"],
     kind_zip: ["A web site; unpack it on any web host", "网站，解压到任意网站主机即可"],
     embed: ["Show it in a web page", "嵌入网页"],
