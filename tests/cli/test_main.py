@@ -161,6 +161,7 @@ def test_the_version_is_one_line(run):
 
 def test_an_unknown_subcommand_is_one_line_with_a_suggestion(refused):
     assert "trian: unknown subcommand; did you mean train?" in refused("trian")
+    assert "use studio (by hand), or convert" in refused("edit")
     assert "choose from studio, demo, make, sfm, train" in refused("xyz")
 
 

@@ -30,7 +30,7 @@ def test_serves_until_a_signal(start, tmp_path, number):
 
 def test_a_folder_that_is_a_file(refused, tmp_path):
     (tmp_path / "file").touch()
-    assert "file" in refused("studio", tmp_path / "file", "--no-browser")
+    assert "drop it on the page" in refused("studio", tmp_path / "file", "--no-browser")
 
 
 def test_the_server_has_no_torch():

@@ -50,6 +50,11 @@ class Studio(Command):
         from snowsplat.studio.library import Library, default_folder
         from snowsplat.studio.one_studio import Running, only_studio
 
+        if self.folder is not None and self.folder.is_file():
+            raise UserError(
+                "{file}: is a file; start the studio without it, and drop it on the page",
+                file=self.folder,
+            )
         library = Library(self.folder or default_folder())
         try:
             with only_studio(library.folder), suppress(KeyboardInterrupt):

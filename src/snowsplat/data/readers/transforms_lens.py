@@ -87,7 +87,7 @@ def _coefficients(where: str, values: Mapping[str, Any], kind: Model) -> list[fl
     by_name = [stated(where, values, name) for name in names]
     listed = values.get("distortion_params")
     if isinstance(listed, list) or all(value is None for value in by_name):
-        return parse.numbers(f"{where}: distortion_params", listed, len(names)).tolist()
+        return [*parse.numbers(f"{where}: distortion_params", listed, len(names)).tolist()]
     return [value or 0.0 for value in by_name]
 
 
