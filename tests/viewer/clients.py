@@ -4,7 +4,7 @@
         visitor.view()
         visitor.pictures(1.0)
 
-    HOSTILE["pings"](url)
+    HOSTILE["garbage"](url, 1.0)
 
 The clients do not depend on the implementation of the servers.
 """
@@ -275,14 +275,6 @@ def wrong_messages() -> list[str]:
     return found
 
 
-def _wrong_types(url: str, seconds: float) -> None:
-    with upgrade(url) as client:
-        client.sendall(frame(view()))
-        for message in wrong_messages():
-            client.sendall(frame(message))
-            time.sleep(0.001)
-
-
 def _random_value(depth: int = 0) -> object:
     """A value of JSON. None of them pauses a training."""
     kind = random.randrange(8 if depth < 3 else 5)
@@ -337,26 +329,9 @@ def _random_messages(url: str, seconds: float) -> None:
             reset(client)
 
 
-def _huge_frame(url: str, seconds: float) -> None:
-    with upgrade(url) as client:
-        client.sendall(frame(b"", length=1 << 62))
-        pour(client, bytes(1 << 16), seconds)
-
-
-def _pings(url: str, seconds: float) -> None:
-    with upgrade(url) as client:
-        pour(client, frame(bytes(125), opcode=9) * 400, seconds)
-
-
 def _millions(url: str, seconds: float) -> None:
     with upgrade(url) as client:
         pour(client, frame(view()) * 200, seconds)
-
-
-def _pieces(url: str, seconds: float) -> None:
-    with upgrade(url) as client:
-        client.sendall(frame(b"x", fin=False))
-        pour(client, frame(b"", opcode=0, fin=False) * 1000, seconds)
 
 
 def _keys(url: str, seconds: float) -> None:
@@ -399,12 +374,6 @@ def _half_open(url: str, seconds: float) -> None:
         client.close()
 
 
-def _long_head(url: str, seconds: float) -> None:
-    with open_socket(url) as client:
-        client.sendall(f"GET {path(url)} HTTP/1.1\r\nHost: localhost\r\n".encode())
-        pour(client, b"X-Padding: " + b"x" * 4000 + b"\r\n", seconds)
-
-
 def _strangers(url: str, seconds: float) -> None:
     """Connections as fast as possible, each closed at once."""
     end = time.monotonic() + seconds
@@ -428,16 +397,11 @@ def _comers(url: str, seconds: float) -> None:
 #: Against the live viewer.
 HOSTILE: dict[str, Callable[[str, float], None]] = {
     "garbage": _garbage,
-    "wrong types": _wrong_types,
     "random messages": _random_messages,
-    "huge frame": _huge_frame,
-    "pings": _pings,
     "millions of messages": _millions,
-    "pieces": _pieces,
     "keys": _keys,
     "never reads": _never_reads,
     "half open": _half_open,
-    "long head": _long_head,
     "strangers": _strangers,
     "comers": _comers,
 }

@@ -95,9 +95,6 @@ def test_an_answer_before_the_body_is_received(server):
     ("headers", "status"),
     [
         (["Content-Length: 10000000000"], 413),
-        (["Content-Length: -1"], 400),
-        (["Content-Length: 0x10"], 400),
-        (["Content-Length: 5", "Content-Length: 6"], 400),
         (["Transfer-Encoding: chunked"], 400),
     ],
 )

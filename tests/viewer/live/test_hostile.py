@@ -81,7 +81,6 @@ def test_the_training_continues_bit_identically(watched, dataset, capfd):
             "garbage": 2,
             "millions_of_messages": 2,
             "random_messages": 2,
-            "pings": 2,
             "never_reads": 6,
             "keys": 2,
         },
