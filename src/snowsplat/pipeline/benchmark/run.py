@@ -106,7 +106,7 @@ def _job(dataset: Path, output: Path, name: str, options: BenchmarkOptions) -> J
         str(output.absolute()),
         options.recipe,
         {**suite.settings, **options.settings},
-        options.resolution or suite.resolutions.get(dataset.name),
+        resolution=options.resolution or suite.resolutions.get(dataset.name),
         lpips=None if options.lpips is None else _lpips(options.lpips),
     )
 
