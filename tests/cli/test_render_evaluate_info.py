@@ -12,6 +12,7 @@ from PIL import Image
 
 from snowsplat.cli.main import main
 from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.training.core import checkpoint
 
 
@@ -208,6 +209,23 @@ def test_info(run, refused, trained, dataset, tmp_path):
     assert "no camera poses" in refused("info", tmp_path)
     (tmp_path / "scene.obj").write_text("v 0 0 0")
     assert "not a known scene file" in refused("info", tmp_path / "scene.obj")
+
+
+def test_info_says_which_photos_were_left_out_and_why(run, trained, dataset, tmp_path):
+    """By the poses, in the record of the dataset; by the training, in its metrics."""
+    metrics = trained / "metrics.json"
+    before = metrics.read_text()
+    metrics.write_text(json.dumps(json.loads(before) | {"left_out": ["view_07.png"]}))
+    out = run("info", trained).out
+    (left_out,) = json.loads(run("info", trained, "--json").out)["left_out"]
+    metrics.write_text(before)
+    assert "view_07.png: the scene does not explain it\n" in out
+    assert (left_out["photo"], left_out["stage"]) == ("view_07.png", "training")
+    folder = shutil.copytree(dataset, tmp_path / "dataset")
+    result = {"unregistered": {"a\x1b_b.jpg": "it matches no other photo"}}
+    record = {"stages": {"poses": {"result": result}}}
+    DatasetFolder(folder).record.write_text(json.dumps(record))
+    assert "  a\ufffd_b.jpg: it matches no other photo\n" in run("info", folder).out
 
 
 def test_info_prints_no_control_characters(run, refused, tmp_path):

@@ -24,7 +24,7 @@ _OF_SCENES += [message("opacity"), message("scale"), message("longest to shortes
 _PLACES = [message("bounds"), message("bounds of 98 percent"), message("origin")]
 _PLACES += [message("metres per unit"), message("extent")]
 _OF_RUNS = [message("step"), message("tensors"), message("background"), message("scenes")]
-_OF_RUNS += [message("checkpoints"), message("metrics"), message("last scene")]
+_OF_RUNS += [message("checkpoints"), message("metrics"), message("last scene"), message("left out")]
 _OF_DATASETS = [message("description"), message("held out with eval"), message("sizes")]
 _OF_DATASETS += [message("focal length pixels"), message("masks"), message("depth maps")]
 _OF_DATASETS += [message("normal maps"), message("impossible"), message("doubtful")]
@@ -52,10 +52,10 @@ class Info(JsonCommand):
     Notes:
       For a file, this command prints the format, the size, the number of
       Gaussians or points, the bounds of the scene, and percentiles of opacity and
-      scale. For a folder, it also prints the photos, scenes, checkpoints and
-      metrics. For a checkpoint, it also checks that the file is not damaged. For
-      photos and videos, it prints what sfm and make would use of them, and how long
-      the camera poses take.
+      scale. For a folder, it also prints the photos, scenes, checkpoints, metrics,
+      and which photos were left out and why. For a checkpoint, it also checks that
+      the file is not damaged. For photos and videos, it prints what sfm and make
+      would use of them, and how long the camera poses take.
     """
 
     path: Path = needed(
@@ -108,6 +108,10 @@ def _print(facts: dict[str, Any], indent: str = "") -> None:
         if isinstance(value, dict) and any(isinstance(v, dict | list) for v in value.values()):
             print(label.rstrip())
             _print(value, indent + "  ")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):  # left out
+            print(label.rstrip())
+            for each in value:
+                print(printable(f"{indent}  {each['photo']}: {each['reason']}"))
         elif isinstance(value, dict):
             inner = ", ".join(f"{k} {_text(v)}" for k, v in value.items())
             print(printable(f"{label} {inner}"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -13,6 +14,8 @@ from snowsplat.data.points_ply import read_points
 from snowsplat.formats import Format, GaussianArrays, ply
 from snowsplat.formats.lod import LEVELS, read_index
 from snowsplat.pipeline.output.scene_files import format_for_reading, read_arrays
+from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import Project
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip
@@ -33,7 +36,8 @@ def describe(path: Path | str) -> dict[str, Any]:
       may also be a folder with a `lod-meta.json` or a SOG `meta.json`.
     - "point cloud": number of points, bounds.
     - "checkpoint": step, configuration, shapes of the tensors. The checksums are verified.
-    - "output folder": dataset, scenes, checkpoints, metrics, and a description of the last scene.
+    - "output folder": dataset, scenes, checkpoints, metrics, the photos that were left out with the
+      reasons, and a description of the last scene.
       ``path`` is the output folder of `train` or of `make`.
     - "zip file": number of photos and videos.
     - "photos" or "video": what `sfm` and `make` would use of it; see `describe_photos`.
@@ -167,9 +171,15 @@ def _output(project: Project) -> dict[str, Any]:
         if not metrics:
             raise UserError("{metrics}: damaged; it is not JSON", metrics=folder.metrics)
         facts["metrics"] = {name: v for name, v in metrics.items() if name != "views"}
+    facts |= _left_out(project.left_out)
     if facts["scenes"]:
         facts["last_scene"] = describe(project.scene_file())
     return facts
+
+
+def _left_out(found: Sequence[LeftOut]) -> dict[str, Any]:
+    """The photos that are not used, with the reasons; nothing if there are none."""
+    return {"left_out": [vars(each) for each in found]} if found else {}
 
 
 def _photos(path: Path, otherwise: UserError) -> dict[str, Any]:
@@ -240,4 +250,5 @@ def _dataset(path: Path) -> dict[str, Any]:
         "bounds": [_rounded(corner) for corner in dataset.bounds.tolist()],
         "impossible": [finding.sentence for finding in findings if finding.impossible],
         "doubtful": [finding.sentence for finding in findings if not finding.impossible],
+        **_left_out(DatasetFolder(path).left_out()),
     }

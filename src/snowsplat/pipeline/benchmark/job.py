@@ -61,10 +61,10 @@ class Job:
     output: str
     recipe: str
     settings: dict[str, Any] = field(default_factory=dict)
-    imports: list[str] = field(default_factory=own_files)  # see `--import`
     resolution: int | None = None
     hold_out: int = 8  # unless the dataset has a split of its own
     lpips: str | None = None
+    imports: list[str] = field(default_factory=own_files)  # see `--import`
 
     @property
     def result(self) -> Path:
