@@ -22,11 +22,15 @@ from PIL import Image
 from snowsplat.extras.image.fit import Fitter
 from snowsplat.extras.image.options import FitOptions
 from snowsplat.ops import reference
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import render
 
 from ..browser import Browser, Page, chromium
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-FIGURES = ["covariance", "projection", "harmonics", "blending", "tiles", "density", "fit"]
+SPACE = ["space-ellipsoid", "space-degrees", "space-order", "space-training"]
+FIGURES = ["covariance", "projection", "harmonics", "blending", "tiles", "density", "fit", *SPACE]
 DRAWN = (
     "[...document.querySelectorAll('.interactive')].every(e => e.querySelector('.status')"
     "?.textContent)"
@@ -129,6 +133,86 @@ def test_every_page_has_its_figures():
     for folder in (DOCS / "learn", DOCS / "zh" / "learn"):
         text = "".join(path.read_text(encoding="utf-8") for path in folder.glob("*.md"))
         assert sorted(re.findall('data-figure="(.*?)"', text)) == sorted(FIGURES)
+
+
+def test_every_slider_shows_its_value_and_each_figure_says_what_to_try(page):
+    shown = """[...document.querySelectorAll("label input[type=range]")].every(input =>
+        Math.abs(Number(input.nextSibling.textContent.replace("−", "-")) - input.value) < 1e-9)"""
+    assert page.evaluate(shown)
+    put(page, "space-degrees", "degree", 1)
+    keys(page, "covariance", "[data-handle=s1]", "ArrowUp")  # changes a slider, too
+    assert page.evaluate(shown)
+    words = page.evaluate("[...document.querySelectorAll('.try')].map(e => e.textContent)")
+    assert len(words) == len(FIGURES) == len(set(words))
+
+
+def picture(page: Page, figure: str) -> np.ndarray:
+    """(H, W, 3) in 0..1: what the canvas of a 3D figure shows."""
+    url = page.evaluate(part(figure, "canvas") + ".toDataURL()")
+    image = Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB")
+    return np.asarray(image) / 255.0
+
+
+def test_the_object_turns_by_keys_mouse_and_touch_in_all_figures(page):
+    turns = [data(page, "space-order", "turn")]
+    keys(page, "space-ellipsoid", "canvas", "ArrowLeft")
+    turns.append(data(page, "space-order", "turn"))
+    x, y = place(page, "space-degrees", "canvas")
+    page.drag(x, y, x + 30, y + 10)
+    turns.append(data(page, "space-order", "turn"))
+    x, y = place(page, "space-training", "canvas")
+    touch(page, (x, y), (x + 20, y), (x + 40, y + 10))
+    turns.append(data(page, "space-order", "turn"))
+    assert len(set(turns)) == 4
+    assert {data(page, figure, "turn") for figure in SPACE} == {turns[-1]}
+    assert page.evaluate("JSON.parse(sessionStorage.space).length") == 2
+
+
+@pytest.mark.nightly
+def test_the_object_is_drawn_as_snowsplat_draws_it(page):
+    """With each degree of SH; the ellipsoid's matrix; the layers; the rounds of the training."""
+    text = (DOCS / "static" / "interactive" / "space-data.js").read_text(encoding="utf-8")
+    stages = json.loads(text[text.index("[[") : text.index("]]") + 2])
+    blob = base64.b64decode(text[text.index('data: "') + 7 : text.rindex('"')])
+    count = stages[-1][1]
+    at = sum(18 * n for _, n in stages[:-1])
+
+    def take(columns: int, low: float, high: float, kind: str = "u1") -> torch.Tensor:
+        nonlocal at
+        values = np.frombuffer(blob, kind, count * columns, at).astype(np.float32)
+        at += count * columns * np.dtype(kind).itemsize
+        top = 65535 if kind == "<u2" else 255
+        return torch.tensor(low + (high - low) * values / top).reshape(count, columns)
+
+    means, log_scales, quats = take(3, -2, 2, "<u2"), take(3, -7, 1), take(4, -1, 1)
+    logits, dc, _ = take(1, 0, 1).clamp(0, 0.9999).logit()[:, 0], take(3, -2.5, 2.5), take(1, 0, 1)
+    rest = take(45, -1, 1).reshape(count, 3, 15).mT.contiguous()
+    assert at == len(blob)
+    object_ = Gaussians(means, log_scales, quats, logits, dc[:, None], rest)
+    for degree in range(4):
+        put(page, "space-degrees", "degree", degree)
+        a, b = (float(v) for v in data(page, "space-degrees", "turn").split(","))
+        y, x = (
+            np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]]),
+            b,
+        )
+        tilt = [[1, 0, 0], [0, math.cos(x), -math.sin(x)], [0, math.sin(x), math.cos(x)]]
+        pose = np.concatenate([np.array(tilt) @ y, [[0], [0], [4]]], axis=1)
+        camera = Camera(660, 660, 1.45 * 660, 1.45 * 660, 330, 330, torch.tensor(pose))
+        expected = render(object_, camera, torch.ones(3), degree).image.clamp(0, 1)
+        found = picture(page, "space-degrees")
+        assert np.abs(found - expected.numpy()).mean() < 0.004
+    put(page, "space-order", "removed", count)
+    assert picture(page, "space-order").min() == 1
+    for name, value in {"s1": 0.5, "s2": 0.2, "s3": 0.1, "x": 0, "y": 0, "z": 1}.items():
+        put(page, "space-ellipsoid", name, value)
+    sigma = [float(v) for v in data(page, "space-ellipsoid", "sigma").split(",")]
+    assert sigma == pytest.approx([0.04, 0, 0, 0.25, 0, 0.01], abs=1e-6)  # 90° around z
+    for stage, (step, number) in enumerate(stages):
+        put(page, "space-training", "stage", stage)
+        words = page.evaluate(part("space-training", ".status") + ".textContent")
+        assert f"Step {step}, {number} Gaussians" in words
+        assert ("clones" in words) == (stage in (2, 4, 6))
 
 
 @pytest.mark.nightly

@@ -8,6 +8,7 @@ import gaussian
 import gradients
 import history
 import initialisation
+import interactive_space
 import interactive_tiles
 import ply
 import projection
@@ -32,6 +33,7 @@ for module in (
     density_control,
     surfaces,
     ply,
+    interactive_space,
     interactive_tiles,
     history,
 ):

@@ -18,11 +18,16 @@
     return parent.appendChild(element);
   }
 
+  const shows = []; // write the values of the sliders beside them
   // Controls. Each returns its input element; `change` is called with the new value.
   function slider(parent, name, label, [min, max, step, value], change) {
     const box = add(parent, "label", {}, `${label} `);
     const input = add(box, "input", { type: "range", name, min, max, step, value });
-    input.addEventListener("input", () => change(Number(input.value)));
+    const shown = add(box, "output"), digits = (String(step).split(".")[1] ?? "").length;
+    const show = () => { shown.textContent = signed(Number(input.value), digits); };
+    input.addEventListener("input", () => { show(); change(Number(input.value)); });
+    shows.push(show);
+    show();
     return input;
   }
   function choice(parent, name, label, options, change) { // options: [value, text]
@@ -87,6 +92,7 @@
     const draw = (content, handles = []) => {
       const focused = svg.contains(document.activeElement) && document.activeElement.dataset.handle;
       shown = handles;
+      for (const show of shows) show(); // a handle may have changed the value of a slider
       svg.innerHTML = content + handles.map(h => `<g class="handle" tabindex="0" role="slider"
         data-handle="${h.name}" aria-label="${h.label}" aria-valuenow="${h.at[0].toFixed(2)}"
         aria-valuetext="${h.text ?? h.at.map(v => signed(v)).join(", ")}">
@@ -113,6 +119,22 @@
     return [mean + half, mean - half, Math.atan2(2 * b, a - c) / 2];
   };
 
+  // What to try with each figure.
+  const TRY = {
+    covariance: t("Try: make Σ₁₂ so large that no ellipse has this matrix.", "试一试：把 Σ₁₂ 调大，直到没有椭圆具有这个矩阵。"),
+    projection: t("Try: move a large Gaussian to the camera. Where does the approximation fail?",
+      "试一试：把一个大的高斯移向相机。近似在哪里失效？"),
+    harmonics: t("Try: which degree does a narrow highlight need? An edge?", "试一试：窄的高光需要几阶？边界呢？"),
+    blending: t("Try: reverse the order, and find a colour that stays the same.", "试一试：颠倒顺序，找一种不变的颜色。"),
+    tiles: t("Try: how many instances does the rule of a square add?", "试一试：正方形规则多出多少个实例？"),
+    density: t("Try: lower the threshold, and count what is split.", "试一试：降低阈值，数一数有多少被分裂。"),
+    fit: t("Try: a photo of yours with 100 and with 1000 Gaussians.", "试一试：用 100 个和 1000 个高斯拟合您的照片。"),
+    "space-ellipsoid": t("Try: two equal scales. Which rotations change Σ now?", "试一试：两个尺度相等。现在哪些旋转会改变 Σ？"),
+    "space-degrees": t("Try: turn the snowman with degree 0, then 3. What moves?", "试一试：先用 0 阶，再用 3 阶转动雪人。什么在动？"),
+    "space-order": t("Try: switch sorting off, and turn. From where does it look right?", "试一试：关闭排序再转动。从哪里看是对的？"),
+    "space-training": t("Try: find a Gaussian that is cloned, and one that is split. Which is larger?",
+      "试一试：找一个被克隆的高斯和一个被分裂的高斯。哪个更大？"),
+  };
   const figures = {};
   window.interactive = { add, slider, choice, tick, button, plot, text, path, ellipse, eigen,
     signed, t, load, figure: (name, draw) => { figures[name] = draw; } };
@@ -125,11 +147,12 @@
     });
   }
   for (const element of document.querySelectorAll("[data-figure]"))
-    load(`${element.dataset.figure}.js`).then(() => {
+    load(`${element.dataset.figure.split("-")[0]}.js`).then(() => {
       element.textContent = "";
       const controls = add(element, "div", { class: "controls" });
       const panels = add(element, "div", { class: "panels" });
       const status = add(element, "p", { class: "status", role: "status" });
+      add(element, "p", { class: "try" }, TRY[element.dataset.figure]);
       return figures[element.dataset.figure]({ element, controls, panels, status });
     });
 })();
