@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from snowsplat.pipeline.benchmark import run as benchmark_run
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import SUITES, Job, SceneResult, suite_of
 from snowsplat.pipeline.options.benchmark import BenchmarkOptions
@@ -137,6 +138,8 @@ def test_suites():
     assert suite_of([]) == "custom"
     assert SUITES["mipnerf360"].resolutions["garden"] == 4
     assert SUITES["mipnerf360"].resolutions["bonsai"] == 2
+    job = benchmark_run._job(Path("garden"), Path("out"), "mipnerf360", BenchmarkOptions())
+    assert (job.resolution, job.imports) == (4, [])
 
 
 @pytest.mark.parametrize(
