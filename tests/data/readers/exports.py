@@ -364,6 +364,7 @@ def matrices(folder: Path, layout: str):
     without distortion, except for TUM."""
     fx, fy, cx, cy = 55.0, 52.0, 30.5, 25.0
     k = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    integer = k - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # the centre of the first pixel is (0, 0)
     worlds = []
     for rotation, translation in rig().values():
         matrix = np.eye(4)
@@ -394,6 +395,29 @@ def matrices(folder: Path, layout: str):
             text(f"pose/{name[4:-4]}.txt", *world)
         text("intrinsics.txt", (fx, cx, cy, 0), (0, 0, 0), (0,), (1,), (HEIGHT, WIDTH))
         fy = fx
+    elif layout == "KITTI":
+        names = [f"image_2/{i:06d}.png" for i in range(4)]
+        shift = np.eye(4)
+        shift[0, 3] = 0.1  # of the colour camera, from the grey one
+        text("poses.txt", *(np.ravel((world @ shift)[:3]) for world in worlds))
+        projection = integer @ np.linalg.inv(np.linalg.inv(shift))[:3]
+        lines = [f"P{i}: " + " ".join(map(repr, projection.ravel().tolist())) for i in (0, 2)]
+        (folder / "calib.txt").write_text("\n".join(lines) + "\n")
+    elif layout == "MVSNet":
+        names = [f"images/{i:08d}.jpg" for i in range(4)]
+        for i, world in enumerate(worlds):
+            text(f"cams/{i:08d}_cam.txt", *np.linalg.inv(world), head="extrinsic\n")
+            with open(folder / f"cams/{i:08d}_cam.txt", "a") as file:
+                file.write("\nintrinsic\n")
+                np.savetxt(file, k)
+                file.write("\n0.5 0.1\n")
+    elif layout == "IDR":
+        names = [f"image/{i:06d}.png" for i in range(4)]
+        cameras = {}
+        for i, world in enumerate(worlds):
+            cameras[f"scale_mat_{i}"] = np.diag([3.0, 3, 3, 1])
+            cameras[f"world_mat_{i}"] = -2.5 * np.pad(integer, (0, 1)) @ np.linalg.inv(world)
+        np.savez(folder / "cameras_sphere.npz", **cameras)
     elif layout == "TUM":
         names = [f"rgb/13{i}.04.png" for i in range(4)]
         rows = []
@@ -410,6 +434,10 @@ def matrices(folder: Path, layout: str):
         (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
         for i in range(4):
             depth(f"results/depth{i:06d}.png", 1 / 6553.5)
+    elif layout == "Tanks and Temples":
+        names = [f"Barn/{i + 1:06d}.jpg" for i in range(4)]
+        text("Barn.log", *(row for i, w in enumerate(worlds) for row in [(i, i, 0), *w]))
+        text("intrinsics.txt", (fx, fy, cx, cy))
     else:
         names = [f"frame_{i:05d}.jpg" for i in range(4)]
         for i, world in enumerate(worlds):

@@ -314,9 +314,7 @@ def test_the_folder_of_an_unpacked_archive_may_be_inside(tmp_path):
     assert photo_folder(tmp_path) == ("Polycam", photos)
 
 
-@pytest.mark.parametrize(
-    "name", ["garden.psx", "Garden.rcproj", "sfm_data.bin", "scan.r3d", "poses.txt", "cams"]
-)
+@pytest.mark.parametrize("name", ["garden.psx", "Garden.rcproj", "sfm_data.bin", "scan.r3d"])
 def test_projects_that_are_not_readable_are_explained(name, tmp_path):
     exports.photos(tmp_path / "images")
     (tmp_path / name).touch()
@@ -329,7 +327,9 @@ def test_projects_that_are_not_readable_are_explained(name, tmp_path):
     [
         ("pose/0.txt", "1 0 0 0\n0 1 0 0\n", "ScanNet"),
         ("groundtruth.txt", "# time x y z\n1.5 0 0 1 0 0 0 1\n", "TUM"),
+        ("poses.txt", "1e0 0 0 0 0 1 0 0 0 0 1 0\n", "KITTI"),
         ("a/b.txt", "1 0 0 0\n", None),
+        ("poses.txt", "poses: none\n", None),
     ],
 )
 def test_poses_without_a_camera_are_named(tmp_path, name, text, program):

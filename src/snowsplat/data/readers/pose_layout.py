@@ -55,6 +55,7 @@ class Layout:
         lens: the camera of all photos: fx, fy, cx, cy, and k1, k2, p1, p2, k3 if there is
             distortion; None if nothing tells it.
         depth_unit: world units per unit of a depth map.
+        inverse: the matrices are cam_from_world.
         opengl: the axes of the cameras are those of OpenGL.
         metric: the world is in metres.
     """
@@ -66,6 +67,7 @@ class Layout:
     frames: Callable[[Path, PhotoFolder], Iterator[Frame]]
     lens: Callable[[Path], Sequence[float] | None]
     depth_unit: Callable[[Path], float] = lambda path: 1.0
+    inverse: bool = False
     opengl: bool = False
     metric: bool = True
 
@@ -127,7 +129,8 @@ class Layout:
             matrix = parse.numbers(where, pose, 16 if len(pose) == 16 else 12).reshape(-1, 4)[:3]
         if self.opengl:
             return parse.from_opengl(where, matrix)
-        return parse.inverse(parse.rigid(where, matrix[:, :3], matrix[:, 3]))
+        rigid = parse.rigid(where, matrix[:, :3], matrix[:, 3])
+        return rigid if self.inverse else parse.inverse(rigid)
 
     def reader(self) -> Reader:
         """The reader of datasets with this layout."""

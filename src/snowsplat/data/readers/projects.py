@@ -9,7 +9,6 @@ from snowsplat.util.messages import Message
 
 _METASHAPE = "export the cameras: File > Export > Export Cameras, as XML"
 _REALITYSCAN = "export the alignment as Internal/External camera parameters (CSV), or as COLMAP"
-_CONVERT = "convert it to a transforms.json"
 _MESHROOM = "add the node ConvertSfMFormat, with the format sfm, after StructureFromMotion"
 # The ending of a file name: what it is, and what to do.
 _PROJECTS = {
@@ -25,10 +24,6 @@ _PROJECTS = {
     ),
     ".p4d": ("a project of Pix4D", "export an undistorted COLMAP model"),
     ".r3d": ("a packed recording of Record3D", "unpack it as a zip archive"),
-    "poses.txt": ("a table of poses, as KITTI has it", _CONVERT),
-    "cams": ("a folder of cameras, as MVSNet has it", _CONVERT),
-    "cameras.npz": ("a file of cameras, as IDR and NeuS have it", _CONVERT),
-    "cameras_sphere.npz": ("a file of cameras, as IDR and NeuS have it", _CONVERT),
     ".nvm": ("a file of VisualSFM", "export bundle.out and list.txt"),
 }
 
