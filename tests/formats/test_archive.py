@@ -1,8 +1,10 @@
-"""Zip files around scenes, checkpoints of gsplat, folders of SOG."""
+"""Zip files around scenes, projects of SuperSplat, checkpoints of gsplat, folders of SOG."""
 
 from __future__ import annotations
 
 import io
+import json
+import math
 import zipfile
 
 import pytest
@@ -12,6 +14,8 @@ from snowsplat.formats import format_for_reading, gsplat_checkpoint, read_gaussi
 from snowsplat.pipeline.describe import describe
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.project.project import Project
+from snowsplat.scene import edit
+from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.util.errors import UserError
 
 
@@ -54,8 +58,6 @@ def test_other_zip_files_are_named(tmp_path, ply, one_line):
     usd = packed(tmp_path / "c.zip", {"a.txt": b"", "scene.usdc": b"."}, zipfile.ZIP_STORED)
     assert "unzip it, and use 'scene.usdc'" in one_line(usd)
     assert "contains 'x'" in one_line(packed(tmp_path / "d.zip", {"x": b""}))
-    project = packed(tmp_path / "f.ssproj", {"document.json": "{}", "splat_0.ply": data})
-    assert "a project of SuperSplat; export its scene" in one_line(project)
     bomb = packed(tmp_path / "e.zip", {"a.ply": data + bytes(40 << 20)})
     assert "would unpack" in one_line(bomb)
 
@@ -66,6 +68,43 @@ def test_a_sog_scene_whose_description_is_not_first(tmp_path, make_scene):
         members = {name: bundle.read(name) for name in reversed(bundle.namelist())}
     again = packed(tmp_path / "b.sog", {"readme.txt": b"", **members})
     assert_same(read_gaussians(tmp_path / "a.sog"), read_gaussians(again))
+
+
+def test_a_project_places_its_visible_splats(tmp_path, ply, caplog):
+    scene, data = ply
+    default = {"position": [0, 0, 0], "rotation": [0, 0, 1, 0], "scale": [1, 1, 1], "visible": True}
+    angle = 0.4
+    # In the frame of the project, which is turned by 180° about z: first that turn, then another
+    # about y, then scale and offset.
+    turn = [math.sin(angle / 2), 0.0, math.cos(angle / 2), 0.0]
+    moved = {"position": [1, 2, 3], "rotation": turn, "scale": [2, 2, 2]}
+    settings = [default, {**default, "visible": False}, moved | {"tintClr": [1, 0.5, 1, 1]}]
+    members = {"document.json": json.dumps({"splats": settings})}
+    members |= {f"splat_{i}.ply": data for i in range(3)}
+    read = read_gaussians(packed(tmp_path / "a.ssproj", members))
+    assert len(read) == 80
+    assert_same(scene, read.select(torch.arange(40)))
+    x, y, z, w = turn
+    in_project = rotation_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64))
+    half = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    place = Similarity(2.0, half @ in_project, half @ torch.tensor([1.0, 2, 3]).double())
+    assert_same(edit.transform(scene, place), read.select(torch.arange(40, 80)), 1e-5)
+    assert "1 hidden splats" in caplog.text
+    assert "colour settings" in caplog.text
+    bare = packed(tmp_path / "b.ssproj", {"document.json": "{}", "splat_0.ply": data})
+    assert_same(scene, read_gaussians(bare))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"scale": [1, 2, 1]}, {"scale": []}, {"scale": [-1] * 3}, {"rotation": [0] * 4},
+     {"rotation": "x"}, {"position": [1e999, 0, 0]}, {"position": None}],
+)  # fmt: skip
+def test_invalid_places_are_reported(tmp_path, ply, one_line, change):
+    own = {"position": [0, 0, 0], "rotation": [0, 0, 1, 0], "scale": [1, 1, 1], **change}
+    document = json.dumps({"splats": [own]})
+    members = {"document.json": document, "splat_0.ply": ply[1]}
+    assert "document.json" in one_line(packed(tmp_path / "a.ssproj", members))
 
 
 def splats_of(scene) -> dict[str, torch.Tensor]:

@@ -312,6 +312,10 @@ def _ply() -> bytes:
         return (Path(folder) / "a.ply").read_bytes()
 
 
+_PLACE_OF_SPLAT = {"position": [1, 2, 3], "rotation": [0, 1, 0, 0], "scale": [2, 2, 2]}
+_PROJECT = json.dumps({"splats": [{**_PLACE_OF_SPLAT, "visible": True, "saturation": 1}]}).encode()
+
+
 def _zip_reader(name: str, file: str, valid: Callable[[], bytes], **more: Any) -> Reader:
     return Reader(
         name, file, lambda folder: (folder / file).write_bytes(valid()), _reads(file), **more
@@ -700,6 +704,13 @@ READERS: tuple[Reader, ...] = (
     Reader("scene a.ply of other trainers", "a.ply", _variant_ply, _reads("a.ply")),
     _zip_reader("scene in a zip file", "a.zip", lambda: _zipped({}, "a.ply")(_ply())),
     _zip_reader("scene in a zip file, its PLY", "a.zip", _ply, pack=_zipped({}, "a.ply")),
+    _zip_reader(
+        "scene ssproj, its document",
+        "a.ssproj",
+        lambda: _PROJECT,
+        json=True,
+        pack=lambda data: _zipped({"splat_0.ply": _ply()}, "document.json")(data),
+    ),
     Reader(
         "gsplat checkpoint",
         "ckpt_7_rank0.pt",

@@ -17,7 +17,7 @@ from snowsplat.ops import device_name
 from snowsplat.pipeline.compute import Compute, open_device
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.train import TrainOptions
-from snowsplat.pipeline.run.dataset_check import check_cameras
+from snowsplat.pipeline.run.dataset_check import check_cameras, edited, stamps_of
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
 from snowsplat.pipeline.run.results import TrainResult
@@ -194,6 +194,7 @@ class _Job:
             self.inform("{time} on this machine: {plan}", time=time, plan=plan.summary())
         if "sweep" in config.starts:
             self.inform("computing depth maps for the initialisation")
+        self.photos = stamps_of(dataset, settings.path)
         self.shards.of_first(Setup(settings, memory.config))
         trainer = self._trainer(dataset, memory.config)
         if options.config is None:
@@ -218,6 +219,7 @@ class _Job:
         dataset = read_dataset(settings)
         # The first run has refused impossible cameras, or not.
         self.doubts, _ = check_cameras(dataset, settings.path, trusted=True)
+        self._compare_photos(dataset, settings.path, meta)
         memory = plan_memory(
             dataset, config, self.device, budget=options.memory, present=_gaussians_in(start)
         )
@@ -267,6 +269,21 @@ class _Job:
             more_gaussians=is_free("max_gaussians"),
             more_often=is_free("densify_interval", "densify_from"),
         )
+
+    def _compare_photos(self, dataset: Dataset, path: str, meta: CheckpointMeta) -> None:
+        """Warn if photos or masks were edited since the training has begun."""
+        self.photos = stamps_of(dataset, path, meta.photos)
+        if meta.photos is not None and (names := edited(meta.photos, self.photos)):
+            text = message(
+                "{edited} of {all} photos and masks were edited after the first step (such as "
+                "{name}); the result is not that of either version; train in a new folder to use "
+                "the edited ones only",
+                edited=len(names),
+                all=len(self.photos),
+                name=names[0],
+            )
+            self.doubts = (*self.doubts, text)
+            logger.warning("warning: %s: %s", path, text)
 
     def _trainer(
         self,
@@ -319,6 +336,7 @@ class _Job:
             budget,
             pace,
             self.doubts,
+            self.photos,
         )
         if (page := self.request.page) is not None:
             page.open_training(trainer, Project.open(self.out.path).name, self.request.observer)

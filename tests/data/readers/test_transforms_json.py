@@ -337,3 +337,12 @@ def test_images_without_a_suffix_are_found(tmp_path, upper):
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 5, "frames": frames}))
     dataset = load_dataset(tmp_path, hold_out=None)
     assert [view.image.path.suffix[1:].lower() for view in dataset.train] == sorted(suffixes)
+
+
+@pytest.mark.parametrize(("focal", "warns"), [(50, False), (51, False), (35.7, True)])
+def test_a_contradictory_angle(scene, caplog, focal, warns):
+    common = {"fl_x": focal, "w": 40, "h": 30, "camera_angle_x": FIELD}
+    with caplog.at_level(logging.WARNING):
+        camera = camera_of(common, {}, scene)
+    assert camera.fx == focal
+    assert ("camera_angle_x (43.6028°) is a focal length of 50 pixels" in caplog.text) == warns

@@ -18,6 +18,7 @@ cam_from_world in OpenCV axes. The world frame is neither centred nor scaled.
 from __future__ import annotations
 
 import logging
+import math
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -52,6 +53,8 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 _MOST_PARTS = 16
 # Memory for JSON values per byte of the text.
 _JSON_RATIO = 2
+# Two statements of a focal length differ by less than this factor, or contradict each other.
+_SAME_LENS = 1.05
 
 _Json = dict[str, Any]
 _Split = Literal["train", "test"]
@@ -144,6 +147,7 @@ def _frames(files: list[Path]) -> tuple[list[_Frame], _Json]:
     first_scene: _Json = {}
     for index, path in enumerate(files):
         scene = _read_json(path)
+        _warn_of_contradictions(path, scene)
         first_scene = first_scene or scene
         split: _Split | None = None
         if len(files) > 1:
@@ -286,6 +290,31 @@ def _depth_map(root: Path, frame: Mapping[str, Any]) -> Path | None:
         path = _path_inside("", root, name)
         return path if is_file(path) else None
     return None
+
+
+def _warn_of_contradictions(path: Path, scene: _Json) -> None:
+    """Warn if ``fl_x`` and ``camera_angle_x`` of the file are of different lenses."""
+    for axis, side in (("x", "w"), ("y", "h")):
+        focal, size, angle = (
+            scene.get(key) for key in (f"fl_{axis}", side, f"camera_angle_{axis}")
+        )
+        numbers = [n for n in (focal, size, angle) if isinstance(n, int | float)]
+        if len(numbers) < 3 or min(numbers) <= 0 or numbers[2] >= math.pi:
+            continue
+        stated = 0.5 * numbers[1] / math.tan(0.5 * numbers[2])
+        if not 1 / _SAME_LENS < numbers[0] / stated < _SAME_LENS:
+            logger.warning(
+                "%s: fl_%s is %g pixels, but camera_angle_%s (%g°) is a focal length of %.5g "
+                "pixels; fl_%s is used; remove the wrong one",
+                path,
+                axis,
+                numbers[0],
+                axis,
+                math.degrees(numbers[2]),
+                stated,
+                axis,
+            )
+            return
 
 
 def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:

@@ -1,10 +1,16 @@
-"""What is checked of a dataset: impossible cameras, and hashes that tell whether it has changed."""
+"""What is checked of a dataset: impossible cameras, and whether it has changed.
+
+Stamps of photos and masks, which `resume` compares, tell what has changed, and hashes of the whole,
+which `make` compares.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 import os
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from snowsplat.data import Dataset
@@ -15,7 +21,57 @@ from snowsplat.util.messages import Message
 
 logger = logging.getLogger(__name__)
 
-_PART = 1 << 16  # bytes at the begin, the middle and the end of a file that a hash covers
+_PART = 1 << 16  # bytes at the begin, the middle and the end of a file that its digest covers
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """A file at one time."""
+
+    size: int  # bytes
+    time: int  # of its last change, in nanoseconds; copies of a file may have another one
+    # Of parts of its content. An edited image is compressed anew, so all parts change.
+    digest: str
+
+
+def stamps_of(
+    dataset: Dataset, folder: Path | str, before: Mapping[str, Stamp] | None = None
+) -> dict[str, Stamp]:
+    """The stamps of photos and masks, by their paths relative to the folder of the dataset.
+
+    Files with the same size and time as in ``before``, earlier stamps, are not read again. Raises
+    OSError.
+    """
+    stamps: dict[str, Stamp] = {}
+    for view in [*dataset.train, *dataset.test]:
+        for image in (view.image, view.mask):
+            if image is not None:
+                name = Path(os.path.relpath(image.path, folder)).as_posix()
+                if name not in stamps:
+                    stamps[name] = _stamp(image.path, (before or {}).get(name))
+    return stamps
+
+
+def edited(before: Mapping[str, Stamp], now: Mapping[str, Stamp]) -> list[str]:
+    """The files with another content, and those that are only in one of both; sorted."""
+
+    def content(stamps: Mapping[str, Stamp]) -> set[tuple[str, int, str]]:
+        return {(name, stamp.size, stamp.digest) for name, stamp in stamps.items()}
+
+    return sorted({name for name, _, _ in content(before) ^ content(now)})
+
+
+def _stamp(path: Path, before: Stamp | None) -> Stamp:
+    status = path.stat()
+    size, time = status.st_size, status.st_mtime_ns
+    if before is not None and (before.size, before.time) == (size, time):
+        return before
+    digest = hashlib.blake2b(digest_size=8)
+    with open(path, "rb") as file:
+        for start in sorted({0, max(0, (size - _PART) // 2), max(0, size - _PART)}):
+            file.seek(start)
+            digest.update(file.read(_PART))
+    return Stamp(size, time, digest.hexdigest())
 
 
 def hash_of_dataset(dataset: Dataset, folder: Path) -> str:
@@ -28,24 +84,9 @@ def hash_of_dataset(dataset: Dataset, folder: Path) -> str:
         digest.update(repr((view.name, intrinsics, pose, view.image.view)).encode())
     if dataset.points is not None:
         digest.update(dataset.points.xyz.numpy().tobytes())
-    views = [*dataset.train, *dataset.test]
-    files = {image.path for view in views for image in (view.image, view.mask) if image is not None}
-    for path in sorted(files):
-        digest.update(os.path.relpath(path, folder).encode("utf-8", "replace"))
-        digest.update(_parts_of(path))
+    stamps = stamps_of(dataset, folder)
+    digest.update(repr(sorted((k, v.size, v.digest) for k, v in stamps.items())).encode())
     return digest.hexdigest()
-
-
-def _parts_of(path: Path) -> bytes:
-    """The size of a file and parts of its content: an edited image is compressed anew, so all parts
-    change. Raises OSError."""
-    size = path.stat().st_size
-    parts = [size.to_bytes(8, "little")]
-    with open(path, "rb") as file:
-        for start in sorted({0, max(0, (size - _PART) // 2), max(0, size - _PART)}):
-            file.seek(start)
-            parts.append(file.read(_PART))
-    return b"".join(parts)
 
 
 def hash_of_files(dataset: DatasetFolder) -> str:

@@ -21,6 +21,7 @@ from snowsplat.data.lens.models import pinhole_of
 from snowsplat.data.points_ply import write_points
 from snowsplat.formats import write_gaussians
 from snowsplat.formats.origin_file import Place, written_with_place
+from snowsplat.pipeline.run.dataset_check import Stamp
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene import camera_json
 from snowsplat.scene.gaussians import Gaussians
@@ -76,6 +77,8 @@ class CheckpointMeta:
     time: dict[str, float] | None = None  # see `TimeBudget.as_json`; None without a time budget
     # The schedule, if it has changed: for a time budget.
     schedule: Schedule | None = None
+    # Stamps of the photos and masks; None in checkpoints of earlier versions.
+    photos: dict[str, Stamp] | None = None
 
     @classmethod
     def from_checkpoint(cls, start: Checkpoint) -> CheckpointMeta:

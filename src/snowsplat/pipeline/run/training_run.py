@@ -14,6 +14,7 @@ from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
+from snowsplat.pipeline.run.dataset_check import Stamp
 from snowsplat.pipeline.run.live_page import LivePage, Watchers
 from snowsplat.pipeline.run.processes import Collective
 from snowsplat.pipeline.run.results import TrainingStopped, TrainResult
@@ -83,6 +84,7 @@ class TrainingRun:
     budget: TimeBudget | None  # None: no time budget
     pace: Pace
     doubts: tuple[Message, ...] = ()  # what is doubtful about the dataset, for the report
+    photos: dict[str, Stamp] | None = None  # stamps of the photos and masks, for checkpoints
 
     def __post_init__(self) -> None:
         self.out, self.observer = self.request.out, self.request.observer
@@ -212,7 +214,7 @@ class TrainingRun:
     def _save_checkpoint(self) -> Path:
         self._restore_folder()
         training = config_to_json(self.config)
-        meta = CheckpointMeta(self.settings, self.recipe, training)
+        meta = CheckpointMeta(self.settings, self.recipe, training, photos=self.photos)
         if self.budget is not None:
             meta = replace(meta, time=self.budget.as_json())
         if self.trainer.schedule.since > 0:

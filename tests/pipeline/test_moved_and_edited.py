@@ -1,10 +1,12 @@
-"""A training whose folder, dataset or photos were moved or renamed."""
+"""A training whose folder or dataset was moved, and photos that are edited before `resume`."""
 
 from __future__ import annotations
 
+import os
 import shutil
 
 import pytest
+from PIL import Image, ImageOps
 
 from snowsplat.pipeline import make
 from snowsplat.pipeline.make_plan import MakePlan
@@ -59,6 +61,26 @@ def test_moved_folders(project, tmp_path, caplog):
     assert "was moved; photos is read from" in caplog.text
     resume(other / "out", TrainOptions(settings={"iterations": 4}))
     assert TrainingFolder(other / "out").scenes() == [2, 4]
+
+
+def test_edited_photos(project, tmp_path, caplog):
+    dataset, out = tmp_path / "dataset", tmp_path / "out"
+    shutil.copytree(project / "dataset", dataset)
+    train(dataset, out, TrainOptions(settings=_longer(2)))
+    photos = sorted((dataset / "images").iterdir())
+    os.utime(photos[1], (1.0, 1.0))
+    resume(out, TrainOptions(settings={"iterations": 4}))
+    assert "edited" not in caplog.text  # only the time of the file has changed
+    ImageOps.invert(Image.open(photos[0]).convert("RGB")).save(photos[0])
+    resume(out, TrainOptions(settings={"iterations": 6}))
+    [warning] = [line for line in caplog.messages if "edited" in line]
+    said = "1 of 6 photos and masks were edited after the first step"
+    assert said in warning
+    assert f"images/{photos[0].name}" in warning
+    assert "edited after the first step" in (out / "report.html").read_text(encoding="utf-8")
+    caplog.clear()
+    resume(out, TrainOptions(settings={"iterations": 8}))
+    assert "edited" not in caplog.text  # it is said once
 
 
 @pytest.mark.parametrize(
