@@ -28,6 +28,17 @@ def test_focal_length_over_the_size_of_a_pixel():
     assert read_exif(exif(details=centimetres), 1500, 1000).focal == pytest.approx(6250)
 
 
+def test_a_cropped_photo_has_the_focal_length_of_the_whole():
+    """As a square of a photo of 16:9, whose other side is that of the original."""
+    original = {0xA002: 6000, 0xA003: 3376, 0xA405: 24}
+    whole = read_exif(exif(details=original), 6000, 3376).focal
+    for size in ((3376, 3376), (6000, 3000)):
+        assert read_exif(exif(details=original), *size).focal == pytest.approx(whole)
+    # Upright, and half as large: not cropped.
+    assert read_exif(exif(details=original), 1688, 3000).focal == pytest.approx(0.5 * whole)
+    assert read_exif(exif(details=original), 1688, 1688).focal is None  # of which size was it?
+
+
 @pytest.mark.parametrize(
     "details",
     [

@@ -117,6 +117,7 @@ _FULL_FRAME_DIAGONAL = 43.2666  # mm, of 36×24
 # Focal lengths divided by the longest side: fields of view of 150° and 1.5°. Values beyond them
 # were not set correctly.
 _WIDEST, _NARROWEST = 0.13, 40
+_SHAPE = 0.02  # logarithms of the ratio of the sides that differ by less are of one shape
 _JPEG_LIMIT = 65000  # bytes of EXIF that fit into a JPEG segment
 
 
@@ -165,21 +166,43 @@ def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
     Cameras store the focal length in one of two ways. A 35 mm equivalent is converted by the ratio
     of the diagonals, as in COLMAP. A focal length in mm is divided by the pixel size. This size is
     that of the original pixels: if a program has resized the photo, the metadata may still describe
-    the original. Therefore the result is multiplied by the ratio of the longest sides.
+    the original. Therefore the result is multiplied by the ratio of the longest sides. Both are of
+    the whole photo, see `_uncropped`.
     """
+    whole = _uncropped(details, width, height)
+    if whole is None:
+        return None
     focal = None
     equivalent = number(details.get(Base.FocalLengthIn35mmFilm))
     length = number(details.get(Base.FocalLength))
     density = number(details.get(Base.FocalPlaneXResolution))
     unit = _PLANE_UNITS_IN_MM.get(details.get(Base.FocalPlaneResolutionUnit, 2))
     if equivalent:
-        focal = equivalent / _FULL_FRAME_DIAGONAL * math.hypot(width, height)
+        focal = equivalent / _FULL_FRAME_DIAGONAL * math.hypot(*whole)
     elif length and density and unit:
-        sizes = [number(details.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)]
-        original = max((size for size in sizes if size), default=max(width, height))
-        focal = length * density / unit * max(width, height) / original
+        original = max(_original_size(details), default=max(whole))
+        focal = length * density / unit * max(whole) / original
     plausible = focal is not None and _WIDEST < focal / max(width, height) < _NARROWEST
     return focal if plausible else None
+
+
+def _original_size(details: Mapping[int, Any]) -> list[float]:
+    """What the camera has stored, in pixels: none to two sides."""
+    sizes = [number(details.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)]
+    return [size for size in sizes if size]
+
+
+def _uncropped(details: Mapping[int, Any], width: int, height: int) -> tuple[float, float] | None:
+    """The size of the whole photo in its pixels of today; None if only a part is left, and it is
+    not known which share.
+
+    A program that crops keeps the metadata. Then the shape differs from that of the original; if
+    one side is the same, the pixels were not resized.
+    """
+    original, now = sorted(_original_size(details)), sorted((width, height))
+    if len(original) < 2 or abs(math.log(now[1] * original[0] / (now[0] * original[1]))) < _SHAPE:
+        return width, height
+    return (original[0], original[1]) if set(original) & set(now) else None
 
 
 def _ifd(exif: Image.Exif, tag: int) -> Mapping[int, Any]:
