@@ -30,6 +30,8 @@ from ...browser import Browser, Page
 
 WIDTH, HEIGHT = 480, 360
 LOADED = "!!window.app"  # the viewer sets it after its first complete frame
+PLACE = """(({ x, y, z }) => [x, y, z])(
+    sse.viewer.app.root.findByName("camera").getPosition())"""
 
 
 def serve(files, headers) -> WebServer:
@@ -161,6 +163,9 @@ def test_a_real_browser_shows_our_render(trained, tmp_path):
     ):
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
+        # At once, although the page has a film.
+        x, y, z = start.position
+        assert page.evaluate(PLACE) == pytest.approx([-x, -y, z], abs=1e-4)
         shown = page.wait_for_picture(lambda shown: psnr(shown, ours) > 30)
         page.screenshot(tmp_path / "viewer.png")  # for inspection
         assert shown.std() > 10

@@ -100,8 +100,6 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
     };
 
     const begin = () => {
-        // In orbit; the viewer itself would begin in its animation.
-        viewer.resetCamera();
         hiding.set(linkedHiding() ?? scene.hiding.start);
         // The list of controls would cover the scene; a button opens it.
         document.querySelector(".sse-controlsHintClose")?.click();
