@@ -40,7 +40,7 @@ BIOME = $(and $(shell command -v node),$(wildcard tests/node/node_modules/.bin/b
 NO_BIOME := lint: JavaScript is not checked; that needs Node, and npm ci --prefix tests/node --ignore-scripts
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo quick test nightly dev docs messages format native wheel compiler lint types layers clean
+.PHONY: demo quick test nightly dev docs gallery messages format native wheel compiler lint types layers clean
 .PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized neon
 
 demo: native $(ENVIRONMENT)
@@ -103,6 +103,10 @@ native: $(TOOLS) | compiler
 	        -DPython3_EXECUTABLE="$(abspath $(shell command -v $(PYTHON)))" >/dev/null; \
 	    cmake --build $(BUILD) -- --quiet; \
 	    cmake --install $(BUILD) --prefix src >/dev/null'
+
+# The scenes that the page "Gallery" links to: about ten minutes.
+gallery: native $(ENVIRONMENT)
+	$(PYTHON) docs/gallery.py
 
 # Always all pages: otherwise, the warnings about unchanged pages would be missing.
 docs: $(ENVIRONMENT)

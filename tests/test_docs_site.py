@@ -21,6 +21,7 @@ from .cache import cached
 
 extras.register()
 ROOT = Path(__file__).resolve().parents[1]
+GALLERY = ROOT / "build" / "gallery"
 
 pytestmark = [
     pytest.mark.nightly,
@@ -81,6 +82,8 @@ def test_every_link_of_the_site_has_a_target(site):
             if address.scheme:
                 continue
             target = (file.parent / unquote(address.path)).resolve() if address.path else file
+            if target.name.startswith("gallery-") and not GALLERY.is_dir():
+                continue  # `make gallery` has not made the scenes
             assert target.exists(), f"{file}: {link}"
             if address.fragment and target in pages:
                 assert unquote(address.fragment) in pages[target].anchors, f"{file}: {link}"
