@@ -97,7 +97,7 @@ def publish(
     large = len(source.gaussians) > _LARGE and not options.for_editing
     write = partial(_write_levels, observer) if large else write_one_file
     with observer.waiting("writing"):
-        write_site(folder, source.ready(), about, url, write)
+        write_site(folder, source.ready(walk=options.walk), about, url, write)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return PublishResult(folder, len(source.gaussians), size)
 

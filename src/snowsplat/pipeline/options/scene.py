@@ -169,4 +169,7 @@ class PublishOptions(Settings):
         check=_problem,
         metavar="URL",
     )
+    walk: bool = switch(
+        "Let people walk through the scene, on its ground and stopped by its walls."
+    )
     for_editing: bool = False

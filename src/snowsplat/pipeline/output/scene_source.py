@@ -137,11 +137,11 @@ class ViewableScene:
     notes: Sequence[tuple[Note, InitialView]] = ()  # annotations, and the views that show them
     turned: bool = False  # a person has turned it upright: −y is up
 
-    def ready(self) -> ReadyScene:
-        """The scene for a page."""
+    def ready(self, *, walk: bool = False) -> ReadyScene:
+        """The scene for a page. ``walk``, and what is raised: see `viewer.web.scene.ready`."""
         notes = [Annotation(note.title, note.text, view) for note, view in self.notes]
         what = self.gaussians, self.cameras, self.background, self.start, notes
-        return ready(*what, turn=not self.turned)
+        return ready(*what, turn=not self.turned, walk=walk)
 
     def frame(self) -> Similarity:
         """The transform to the frame of its page."""

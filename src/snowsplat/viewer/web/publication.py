@@ -31,6 +31,8 @@ from snowsplat.viewer.web.viewer_page import asset, content_policy, page, whole_
 
 #: The size that services recommend for the picture of a link (Open Graph).
 POSTER_SIZE = (1200, 630)
+#: The file with the surfaces that stop a person who walks.
+GROUND = "ground.glb"
 #: Largest scene in bytes. Browsers support strings of about 500 million characters, and base64
 #: makes 4 characters of 3 bytes.
 _LARGEST = 360_000_000
@@ -90,6 +92,8 @@ def write_site(
         write_bytes(files / POSTER, _poster(scene))
         if scene.stops.views:
             write_bytes(files / PICTURES, scene.stops.pictures)
+        if scene.ground:
+            write_bytes(files / GROUND, scene.ground)
         for name in ("index.css", "index.js"):
             write_text(files / name, asset(name))
         write_text(files / "viewer-licence.txt", asset("LICENSE"))
@@ -102,6 +106,8 @@ def _page(scene: ReadyScene, about: Description, url: str, files: str, content: 
     bootstrap = scene.bootstrap(about, f"./{files}{PICTURES}")
     facts = about.facts(len(scene.gaussians))
     bootstrap |= {"contentUrl": f"./{files}{content}", "posterUrl": f"./{files}{POSTER}"}
+    if scene.ground:
+        bootstrap["collisionUrl"] = f"./{files}{GROUND}"
     tags = _tags(
         {
             "og:type": "website",

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch.nn.functional import normalize
 
-from snowsplat.formats import GaussianArrays
+from snowsplat.formats import GaussianArrays, glb
 from snowsplat.formats.compressed_ply import encode_compressed_ply
 from snowsplat.formats.lod import lod_files
 from snowsplat.scene.camera import Camera
@@ -22,6 +22,7 @@ from snowsplat.scene.geometry import Similarity, rotation_from_quat, shortest_ro
 from snowsplat.scene.initial_view import InitialView, bounding_sphere, overview, view_of_camera
 from snowsplat.scene.orientation import VIEWING_DISTANCE, scene_up, up_of_surfaces
 from snowsplat.scene.render import render
+from snowsplat.surface.ground import Ground, ground_of
 from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.static import Served, ServedFile, served
@@ -37,6 +38,7 @@ _KEYFRAMES = 121  # of the film; the viewer interpolates between them
 _LEVEL_ENOUGH = math.radians(3)  # a smaller tilt of the horizon is not visible
 _SURFACES = 20_000  # maximum number of surfaces that determine the up direction
 _UP = np.array([0.0, -1.0, 0.0])  # of the viewer
+_EYE_HEIGHT = 1.3  # of the viewer, above the ground, where people walk
 _TOO_LARGE = 3.0  # maximum factor between the distances of the scene and the usual ones
 _TOO_FAR = 30.0  # the same for an overview: a house in metres is walked through in metres
 
@@ -101,6 +103,7 @@ class ReadyScene(NamedTuple):
     metres: float | None  # in a unit of the scene that was given, if that is known
     first: int  # the stop of the initial view; -1: it was given, or there are no stops
     notes: Sequence[Annotation] = ()
+    ground: bytes = b""  # a GLB file of what stops a person who walks; empty: nobody walks
 
     def camera(self, width: int, height: int) -> Camera:
         """What a window of this size, in pixels, shows at first."""
@@ -146,14 +149,24 @@ def ready(
     notes: Sequence[Annotation] = (),
     *,
     turn: bool = True,
+    walk: bool = False,
 ) -> ReadyScene:
     """The scene in a frame that suits the viewer, and views in that frame.
 
     ``start``: the initial view; None: the `first_stop`, or an overview. ``turn``: see
-    `viewing_frame`.
+    `viewing_frame`. ``walk``: with the ground, in a frame in metres, so that people walk through
+    the scene at their size. If the scene is not known in metres, photos are taken at the height of
+    the eyes.
+
+    Raises: UserError: ``walk``, but no ground is known; see `ground_of`.
     """
     change, depth = viewing_frame(gaussians, cameras, turn=turn)
     metres = gaussians.metres_per_unit
+    ground = None
+    if walk:
+        change = change or Similarity.identity()
+        ground = ground_of(gaussians, cameras, change.rotation.T.numpy() @ _UP)
+        change = replace(change, scale=metres or _EYE_HEIGHT / ground.eye_height)
     if change is not None:
         gaussians = transform(gaussians, change)
         depth *= change.scale
@@ -166,9 +179,18 @@ def ready(
     first = first_stop(stops) if cameras and start is None else -1
     start = start or (stops.view(first) if cameras else overview(gaussians))
     scale = change.scale if change else 1.0
-    return ReadyScene(
-        gaussians, start, film, stops, background, hiding, scale, metres, first, notes
-    )
+    found = gaussians, start, film, stops, background, hiding, scale, metres, first, notes
+    return ReadyScene(*found, b"" if ground is None else _ground_file(ground, change))
+
+
+def _ground_file(ground: Ground, change: Similarity | None) -> bytes:
+    """A GLB file in the world of the viewer, which turns scenes by 180° about z: y is up."""
+    assert change is not None
+    vertices = change.apply(torch.from_numpy(ground.vertices).double()).numpy() * [-1, -1, 1]
+    rows = ground.faces.astype("<u4").reshape(-1, 1)
+    attributes = {"POSITION": vertices.astype("<f4")}
+    scene, arrays = glb.contents({"mesh": 0}, {"mode": 4}, attributes, rows)
+    return b"".join(glb.pack({"asset": {"version": "2.0"}} | scene, arrays))
 
 
 def viewing_frame(
