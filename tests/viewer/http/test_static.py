@@ -58,6 +58,11 @@ def ask(
     return response, body
 
 
+def test_connections_that_are_gone_end(server):
+    kept = server._socket.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    assert kept
+
+
 def test_address(server):
     assert re.fullmatch(rf"http://127\.0\.0\.1:{server.port}/[\w-]{{20,}}/", server.url)
     with serve(FILES, POLICY) as other:
