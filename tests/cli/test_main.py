@@ -165,6 +165,13 @@ def test_an_unknown_subcommand_is_one_line_with_a_suggestion(refused):
     assert "choose from studio, demo, make, sfm, train" in refused("xyz")
 
 
+def test_a_path_in_place_of_a_subcommand_is_answered_with_what_suits_it(refused, tmp_path):
+    assert f"snowsplat make {tmp_path}" in refused(tmp_path)
+    scene = tmp_path / "a.splat"
+    scene.write_bytes(bytes(32))
+    assert f"snowsplat view {scene}" in refused(scene)
+
+
 def test_a_misplaced_flag_is_found_in_its_subcommand(run):
     assert "snowsplat train --help" in run("--iterations", "3").err
 

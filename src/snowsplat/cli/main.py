@@ -151,6 +151,8 @@ def _unknown_subcommand(name: str) -> Message:
     hint: Message | str | None = advice(name)
     if hint is None and os.path.exists(name):
         make = next_step(message("to make a scene"), "make", name)
+        if _is_scene(name):
+            make = next_step(message("to see it"), "view", name)
         hint = message("{make}; {info}", make=make, info=next_step(message("or"), "info", name))
     elif hint is None and similar:
         hint = message("did you mean {name}?", name=similar[0])
@@ -161,6 +163,18 @@ def _unknown_subcommand(name: str) -> Message:
         name=name,
         hint=hint,
     )
+
+
+def _is_scene(path: str) -> bool:
+    """Whether this is a file of a known format, or a folder with a scene."""
+    from snowsplat.formats.registry import format_for_reading
+    from snowsplat.project.project import Project
+
+    try:
+        scene = Project.open(path).scene
+        return scene is not None and format_for_reading(scene) is not None
+    except (OSError, UserError):
+        return False
 
 
 def _is_out_of_memory(error: RuntimeError) -> bool:
