@@ -35,7 +35,7 @@ SUBCOMMANDS = {
         ("studio", "[FOLDER]", "all of this in the browser"),
         ("demo", "", "try it, without own photos"),
         ("make", "PHOTOS", "photos or a video -> a scene"),
-        ("sfm", "PHOTOS -o DATASET", "photos or a video -> a dataset"),
+        ("sfm", "PHOTOS -o DATASET", "photos, video -> a dataset with poses"),
         ("train", "DATASET -o OUT --eval", "a dataset -> a scene in OUT"),
         ("evaluate", "OUT", "PSNR and SSIM on the held-out photos"),
         ("render", "OUT", "images and videos of the scene"),
@@ -97,6 +97,5 @@ def overview() -> str:
     return _OVERVIEW.format(subcommands="\n".join(lines))
 
 
-_OVERVIEW = """3D Gaussian Splatting on any computer: makes a 3D scene from photos or a video.
-{subcommands}
-A dataset: photos with their camera poses. Help for each: snowsplat NAME --help"""
+_OVERVIEW = """3D scenes from photos (Gaussian Splatting). For each: snowsplat NAME --help
+{subcommands}"""
