@@ -246,6 +246,18 @@ def test_a_solution_passes_the_checks_and_an_empty_answer_fails(path, here, caps
         ("10_density_control", "nanmean(dim=0)", "nansum(dim=0)", "then the mean"),
         ("10_density_control", "alive & ~split", "alive", "does not stay"),
         ("10_density_control", "1.6", "2.0", "Divide scales by 1.6"),
+        ("11_structure_from_motion", "R @ pose_a[:, 3]", "pose_a[:, 3]", "relative to a"),
+        ("11_structure_from_motion", "- poses[:, :2]", "+ poses[:, :2]", "is perpendicular to"),
+        ("11_structure_from_motion", ".min())", ".max())", "largest angle of all pairs"),
+        ("12_surfaces", "alphas[:-1]", "alphas[1:]", "of those in front of it"),
+        ("12_surfaces", "(depths - z)", "(z - depths)", "too far behind|Positive in front"),
+        ("12_surfaces", "(z > 0) & ", "", "6 behind the camera"),
+        (
+            "12_surfaces",
+            "torch.where(weights > 0, distances * weights, 0.0)",
+            "(distances * weights)",
+            "NaN is NaN",
+        ),
     ],
 )
 def test_a_wrong_answer_fails_with_a_hint(name, right, wrong, hint, here):
