@@ -37,8 +37,8 @@ def config_from_json(values: dict[str, Any], strict: bool = False) -> TrainConfi
     name = values.pop(_DENSITY_NAME)
     if not isinstance(name, str) or name not in DENSITY_CONTROLS:
         raise UserError(
-            "the configuration: the density control {name} is not registered; call "
-            "snowsplat.training.settings.register_density with its class before resuming",
+            "the configuration: the density control {name} is not registered; name "
+            "the file that registers it with --import, or call register_density with its class",
             name=quoted(name),
         )
     kinds: dict[str, type] = {
