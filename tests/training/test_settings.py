@@ -318,7 +318,7 @@ def test_a_plain_dataclass_of_a_user_is_a_density_control(monkeypatch):
     with pytest.raises(SettingError, match="^density: .* has no max_gaussians"):
         recipe("classic", density=make_dataclass("Empty", [])())
     written = json.loads(json.dumps(config_to_json(config)))
-    with pytest.raises(UserError, match="density control 'Plain' is not registered; call .*regis"):
+    with pytest.raises(UserError, match="density control 'Plain' is not registered; name .*regis"):
         config_from_json(written)
     monkeypatch.setitem(DENSITY_CONTROLS, "Other", McmcDensity)  # restores the table
     monkeypatch.delitem(DENSITY_CONTROLS, "Other")
