@@ -237,6 +237,7 @@ def test_a_solution_passes_the_checks_and_an_empty_answer_fails(path, here, caps
         ("06_blending", ".clamp(max=0.99)", "", "at most 0.99"),
         ("06_blending", "alpha < 1 / 255", "alpha < 0", "Skip a splat"),
         ("06_blending", "break", "continue", "After the stop"),
+        ("06_blending", "torch.where(after < 1e-4, 0.0, alphas)", "alphas", "Masks in place"),
         ("07_gradients", "colors[i] - behind)", "colors[i] - background)", "what is behind"),
         ("08_rasterizer", "+ TILE - 1", "+ TILE", "16 i \\+ 15.5"),
         ("08_rasterizer", "depths.argsort(stable=True)", "depths.argsort().flip(0)", "nearest"),
