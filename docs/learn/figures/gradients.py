@@ -128,8 +128,89 @@ def differences() -> None:
     panel.save("gradients-differences", "Two V-shaped curves of the error over the step size")
 
 
+def across_an_edge() -> None:
+    """The gradients of both parts of the loss, at the pixels of a line across a blurred edge."""
+    x = torch.arange(48) - 23.5
+    photo = 0.2 + 0.6 * (x > 0).double()
+    image = (0.2 + 0.6 * torch.sigmoid(x / 2.5).double()).expand(48, 48).clone().requires_grad_()
+    pixels, target = image[..., None].expand(48, 48, 3), photo.expand(48, 48)[..., None]
+    target = target.expand(48, 48, 3)
+    ssim = reference.photometric_loss(pixels, target, 1.0)
+    (of_ssim,) = torch.autograd.grad(ssim, image)
+    of_ssim = of_ssim[24] / of_ssim.abs().max()
+    of_l1 = torch.sign(image.detach()[24] - photo)
+    panel = Drawing(340, 220, x=(-12, 12), y=(-1.2, 1.2), margins=(44, 26, 10, 40))
+    panel.axes("pixel", "gradient", counts=(5, 5))
+    panel.line([(-12, -0.6), (0, -0.6), (0, 0.6), (12, 0.6)], "soft", 5, opacity=0.4)
+    for values, colour, words, dy in ((of_l1, "blue", "L1", 14), (of_ssim, "orange", "SSIM", 32)):
+        inside = [(a, b) for a, b in zip(x.tolist(), values.tolist(), strict=True) if abs(a) < 12]
+        panel.line(inside, colour, 2)
+        panel.text((12, 1.2), words, colour, anchor="end", dx=-4, dy=dy)
+    panel.save("gradients-edge", "Two curves of a gradient across an edge")
+
+
+def filter_factor() -> None:
+    """√(det UUᵀ / det Σ′) of a round splat, and its derivative by ln σ."""
+    panel = Drawing(340, 220, x=(0, 3), y=(0, 1.1), margins=(44, 26, 10, 40))
+    panel.axes("σ in pixels", "o′ / o", counts=(4, 5))
+    sigma = torch.linspace(0.01, 3, 120, dtype=torch.float64, requires_grad=True)
+    factor = sigma**2 / (sigma**2 + 0.3)
+    (slope,) = torch.autograd.grad(factor.sum(), sigma)
+    for values, colour, words, dy in (
+        (factor, "blue", "factor", 40),
+        (slope * sigma, "orange", "derivative by ln σ", 120),
+    ):
+        points = torch.stack([sigma, values], 1).tolist()
+        panel.line(points, colour, 2)
+        panel.text((3, 1.1), words, colour, anchor="end", dx=-4, dy=dy)
+    panel.save("gradients-filter", "A curve that rises to 1, and its derivative, a bump")
+
+
+def without_length() -> None:
+    """The gradient of a quaternion has no part along it: lines of equal loss are rays."""
+    panel = Drawing(340, 220, x=(-1.6, 1.6), y=(-0.35, 1.75), equal=True, margins=(4, 4, 4, 4))
+    circle = np.linspace(-0.1, np.pi + 0.1, 60)
+    panel.line(np.stack([np.cos(circle), np.sin(circle)], 1), "line", 2)
+    for angle in np.radians(range(10, 171, 20)):
+        ray = np.array([np.cos(angle), np.sin(angle)])
+        panel.line([0 * ray, 1.6 * ray], "line", 1, dash="4 4")
+    q, g = 1.3 * np.array([np.cos(0.9), np.sin(0.9)]), np.array([-0.15, 0.7])
+    tangent = (g - (g @ q) / (q @ q) * q) / np.linalg.norm(q)
+    panel.arrow((0, 0), q, "ink")
+    panel.arrow(q, q + g, "soft")
+    panel.arrow(q, q + tangent, "orange", 2.4)
+    panel.text(q, "q", anchor="start", dx=6, dy=12)
+    panel.text(q + g, "∂L/∂q̂", "soft", anchor="start", dx=8, dy=12)
+    panel.text(q + tangent, "∂L/∂q", "orange", anchor="end", dx=-6)
+    panel.save("gradients-quaternion", "A vector, its gradient, and the part of it across")
+
+
+def motion_of_pixels() -> None:
+    """How pixels move if the camera turns, and if it moves ahead."""
+    for name, words, move in (
+        ("turn", "turn about y", lambda p: np.cross([0, 1, 0], p)),
+        ("ahead", "move ahead", lambda p: np.array([0, 0, -1.0])),
+    ):
+        panel = Drawing(330, 220, x=(-1, 1), y=(0.66, -0.66), margins=(6, 26, 6, 6))
+        panel.rectangle((-1, -0.66), (1, 0.66), "line")
+        for x in np.linspace(-0.8, 0.8, 7):
+            for y in np.linspace(-0.5, 0.5, 5):
+                for depth, colour in ((1.5, "orange"), (4.0, "blue")):
+                    p = depth * np.array([x, y, 1])
+                    d = move(p)
+                    shift = 0.13 * (d[:2] - p[:2] / p[2] * d[2]) / p[2]
+                    shift = shift if name == "turn" else 3 * shift
+                    panel.arrow((x, y), (x + shift[0], y + shift[1]), colour, 1.4)
+        panel.title(words)
+        panel.save(f"gradients-{name}", f"Arrows at the pixels: {words}")
+
+
 def main() -> None:
     chain()
+    across_an_edge()
+    filter_factor()
+    without_length()
+    motion_of_pixels()
     differences()
 
 
