@@ -157,6 +157,17 @@ def test_a_mask_of_the_wrong_size_and_a_mask_without_a_photo(tmp_path, caplog):
         gathered(root, tmp_path / "other")
 
 
+def test_cropped_photos_are_told(tmp_path, caplog):
+    root = write_photos(tmp_path / "p")
+    data = exif(details={0xA002: 2 * WIDTH, 0xA003: HEIGHT, 0xA405: 26})
+    photo().save(root / "x.jpg", exif=data)
+    with caplog.at_level(logging.WARNING, "snowsplat"):
+        made = gathered(root, tmp_path / "out")
+    assert f"1 of {len(made.photos)} photos were cropped after they were taken (such as x.jpg)" in (
+        caplog.text
+    )
+
+
 def test_a_completely_masked_photo_is_skipped(tmp_path):
     root = write_photos(tmp_path / "p", 4)
     (root / "masks").mkdir()

@@ -100,6 +100,7 @@ def gather(
     left_out = list(sources.left_out)
     in_place = sources.contain(folder)
     planned = plan_photos(sources.photos, options, left_out)
+    _warn_of_cropped(planned)
     clips = [(video, read_clip(video.path)) for video in sources.videos]
     around = [_shows_all_around(clip, options) for _, clip in clips]
     if in_place:
@@ -135,6 +136,22 @@ def gather(
     if len(photos) < MIN_PHOTOS:
         raise _too_few(len(photos), left_out)
     return Gathered(photos, left_out, notes)
+
+
+def _warn_of_cropped(planned: Sequence[Planned]) -> None:
+    """The photos of a lens share its axis; a program moves it, for each photo elsewhere."""
+    cropped = [plan for plan in planned if plan.header.exif.cropped and not plan.header.panorama]
+    if cropped:
+        logger.warning(
+            "%s",
+            message(
+                "{count} of {all} photos were cropped after they were taken (such as {name}); if "
+                "each was cropped elsewhere, poses are worse; use the originals",
+                count=len(cropped),
+                all=len(planned),
+                name=cropped[0].name,
+            ),
+        )
 
 
 def _with_panoramas(photos: list[Photo]) -> list[Photo]:

@@ -29,14 +29,24 @@ def test_focal_length_over_the_size_of_a_pixel():
 
 
 def test_a_cropped_photo_has_the_focal_length_of_the_whole():
-    """As a square of a photo of 16:9, whose other side is that of the original."""
+    """What is left is the largest part of its shape."""
     original = {0xA002: 6000, 0xA003: 3376, 0xA405: 24}
-    whole = read_exif(exif(details=original), 6000, 3376).focal
-    for size in ((3376, 3376), (6000, 3000)):
-        assert read_exif(exif(details=original), *size).focal == pytest.approx(whole)
+    whole = read_exif(exif(details=original), 6000, 3376)
+    assert not whole.cropped
+    for size, scale in (((3376, 3376), 1), ((6000, 3000), 1), ((1688, 1688), 0.5)):
+        found = read_exif(exif(details=original), *size)
+        assert found.focal == pytest.approx(scale * whole.focal)
+        assert found.cropped
     # Upright, and half as large: not cropped.
-    assert read_exif(exif(details=original), 1688, 3000).focal == pytest.approx(0.5 * whole)
-    assert read_exif(exif(details=original), 1688, 1688).focal is None  # of which size was it?
+    half = read_exif(exif(details=original), 1688, 3000)
+    assert (half.focal, half.cropped) == (pytest.approx(0.5 * whole.focal), False)
+    # Stitched of several.
+    assert read_exif(exif(details=original), 12000, 3376).focal is None
+
+
+def test_a_cropped_photo_and_the_size_of_a_pixel():
+    details = {0x920A: 50.0, 0xA20E: 5000.0, 0xA210: 2, 0xA002: 6000, 0xA003: 4000}
+    assert read_exif(exif(details=details), 1000, 1000).focal == pytest.approx(50 * 1250 / 25.4)
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,7 @@ _FULL_FRAME_DIAGONAL = 43.2666  # mm, of 36×24
 # Focal lengths divided by the longest side: fields of view of 150° and 1.5°. Values beyond them
 # were not set correctly.
 _WIDEST, _NARROWEST = 0.13, 40
-_SHAPE = 0.02  # logarithms of the ratio of the sides that differ by less are of one shape
+_SAME_SHAPE = 0.02  # the largest difference of the logarithms of the ratio of the sides
 _JPEG_LIMIT = 65000  # bytes of EXIF that fit into a JPEG segment
 
 
@@ -131,6 +131,7 @@ class ExifInfo:
     location: Location | None = None  # latitude, longitude (°), altitude (m)
     location_error: float | None = None  # m, horizontal, as the receiver states it
     attitude: Attitude | None = None  # in the frame of the upright photo
+    cropped: bool = False  # after the camera has stored the photo
 
 
 def read_exif(
@@ -154,6 +155,7 @@ def read_exif(
         orientation=orientation,
         camera=" ".join([*filter(None, named), *(f"{f:g} mm" for f in zoom if f)]),
         focal=_focal(details, width, height),
+        cropped=_uncropped(details, width, height) != (max(width, height), min(width, height)),
         location=location,
         location_error=location_error,
         attitude=read_attitude(exif, details, gps, xmp, taken or orientation),
@@ -186,23 +188,28 @@ def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
     return focal if plausible else None
 
 
-def _original_size(details: Mapping[int, Any]) -> list[float]:
+def _original_size(details: Mapping[int, Any]) -> tuple[float, ...]:
     """What the camera has stored, in pixels: none to two sides."""
-    sizes = [number(details.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)]
-    return [size for size in sizes if size]
+    sizes = (number(details.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight))
+    return tuple(size for size in sizes if size)
 
 
 def _uncropped(details: Mapping[int, Any], width: int, height: int) -> tuple[float, float] | None:
-    """The size of the whole photo in its pixels of today; None if only a part is left, and it is
-    not known which share.
+    """The longer and the shorter side of the whole photo in its pixels of today.
 
-    A program that crops keeps the metadata. Then the shape differs from that of the original; if
-    one side is the same, the pixels were not resized.
+    A program that crops a photo keeps the metadata of the camera. Then the shape is another one,
+    and what is left is assumed to be the largest part of the original that has this shape. None: it
+    is larger than the original, as a picture that was made of several photos.
     """
-    original, now = sorted(_original_size(details)), sorted((width, height))
-    if len(original) < 2 or abs(math.log(now[1] * original[0] / (now[0] * original[1]))) < _SHAPE:
-        return width, height
-    return (original[0], original[1]) if set(original) & set(now) else None
+    now, original = (max(width, height), min(width, height)), _original_size(details)
+    if len(original) < 2:
+        return now
+    original = max(original), min(original)
+    ratios = now[0] / original[0], now[1] / original[1]
+    if abs(math.log(ratios[0] / ratios[1])) < _SAME_SHAPE:
+        return now
+    scale = max(ratios)
+    return None if scale > 1.0 else (scale * original[0], scale * original[1])
 
 
 def _ifd(exif: Image.Exif, tag: int) -> Mapping[int, Any]:
@@ -222,6 +229,8 @@ def exif_for_copy(exif: Image.Exif, width: int, height: int) -> bytes:
         copy.load(exif.tobytes())
         copy[Base.Orientation] = 1
         details = copy.get_ifd(IFD.Exif)
+        if _uncropped(details, width, height) != (max(width, height), min(width, height)):
+            details.pop(Base.FocalLengthIn35mmFilm, None)  # of the whole photo
         # A maker note contains offsets into the old file. The pixels per unit may have changed.
         plane = (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
         for tag in (Base.MakerNote, Base.UserComment, *plane, Base.FocalPlaneResolutionUnit):
