@@ -128,6 +128,7 @@ def test_the_flags_to_use_exist():
         ("evaluate --load-config c.yml", "--load-config: use no flag: snowsplat evaluate OUT"),
         ("convert -s garden --resize", "-s: convert.py is snowsplat sfm -s DATASET"),
         ("evaluate out --max-steps 4", "--max-steps: unknown flag; leave it out"),  # it has none
+        ("make photos --gpu --iterations 9", "--gpu: use --device; --iterations: use --quality"),
         (
             "train mcmc garden -o out",
             "garden: too many names; use --recipe mcmc; snowsplat train DATASET -o OUT --eval",

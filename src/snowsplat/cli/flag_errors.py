@@ -34,6 +34,8 @@ _FLAGS = {
     "-o": "result-dir output-dir output-path experiment-name",
     "-r": "data-factor downscale-factor camera-res-scale-factor",
     "--iterations": "max-steps max-num-iterations steps max-iterations num-iterations",
+    "--quality": "iterations preset",  # of make, where there is no --iterations
+    "--device": "gpu gpus cuda cpu",
     "--max-gaussians": "cap-max max-gs-num",
     "--eval": "test-every eval-mode eval-interval train-split-fraction",
     "--test-iterations": "eval-steps steps-per-eval-all-images",
@@ -176,6 +178,6 @@ def advice(subcommand: str, name: str, flags: Collection[str]) -> str | None:
         return "leave it out; it was removed, because the default recipe does not overfit"
     if word in ("save-ply", "disable-video"):
         return "leave it out; train writes the scene as PLY, and render writes videos"
-    of_word = {w: new for new, words in _FLAGS.items() for w in words.split()}
+    of_word = {w: new for new, words in _FLAGS.items() if new in flags for w in words.split()}
     new = next((of_word[w] for w in (word, *groups[::-1]) if w in of_word), None)
-    return f"use {new}" if new in flags else None
+    return f"use {new}" if new else None
