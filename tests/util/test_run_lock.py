@@ -17,7 +17,7 @@ import pytest
 from snowsplat.util import run_lock
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_text
-from snowsplat.util.run_lock import LOCK, InUse, LostLock, is_locked, one_run
+from snowsplat.util.run_lock import LOCK, InUse, LostLock, is_locked, locked, one_run
 
 _HOLD = """
 import sys, time
@@ -45,6 +45,21 @@ def test_one_run(tmp_path):
     assert not (tmp_path / "empty").exists()
     with pytest.raises(UserError, match="is a file"), one_run(folder / "result"):
         pass
+
+
+def test_a_lock_that_is_no_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/usr/lib/snowsplat/__main__.py", "studio", "my scenes"])
+    file = tmp_path / "edit.lock"
+    with locked(file, "garden"):
+        assert is_locked(file)
+        begin = time.monotonic()
+        with pytest.raises(
+            InUse, match=r"^garden: in use by .*: snowsplat studio 'my scenes'; wait"
+        ):
+            locked(file, "garden", wait=0.2).__enter__()
+        assert 0.2 <= time.monotonic() - begin < 2.0
+    assert not file.exists()
+    assert not is_locked(file)
 
 
 def test_a_killed_process_leaves_no_lock(tmp_path):
