@@ -16,6 +16,11 @@ but neither its poses nor its points:
 The poses of the dataset are used only to measure errors and for the comparison in step 4. Writes
 OUT/result.json and OUT/held_out.png: for each held-out photo, the photo, the scene with the poses
 found here, and the scene with the poses of the dataset.
+
+    python experiments/without_sfm/run.py PHOTOS -o OUT && snowsplat train OUT -o OUT/scene
+
+takes a folder of photos without poses, in the order of their names: steps 1 to 3. The focal length
+is that of the EXIF data, or that of phones. OUT is then a dataset: photos, poses and points.
 """
 
 from __future__ import annotations
@@ -33,16 +38,22 @@ from PIL import Image
 from poses import Poses
 from torch import Tensor
 
+from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.dataset import Dataset, Points, View
+from snowsplat.data.lens.models import pinhole_of
 from snowsplat.data.load import load_dataset
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.evaluation.metrics import psnr
+from snowsplat.extras.lift.lift_photo import read_photo
+from snowsplat.pipeline.output.image_files import write_png
+from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import invert_rigid
-from snowsplat.scene.render import render
+from snowsplat.scene.render import render, to_8bit
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.settings.recipes import recipe
 
+SUFFIXES = (".jpg", ".jpeg", ".png")
 #: Number of photos whose poses are found together with the first depths.
 START = 5
 #: (factor of the photos, cells along the longer side of the depths, steps)
@@ -68,31 +79,36 @@ def held_out(i: int) -> bool:
     return i >= START and i % 8 == 7
 
 
-def find(views: list[View], photos: list[Tensor], generator: torch.Generator) -> Found:
-    """Steps 1 to 3."""
-    poses = Poses(views[0].camera, len(views))
+def find(
+    camera: Camera, photos: list[Tensor], generator: torch.Generator, views: list[View] | None
+) -> Found:
+    """Steps 1 to 3. ``views``: the same photos with known poses, for `Found.errors`."""
+    poses = Poses(camera, len(photos))
     first = poses.part(START)
     inverse = first_depths(photos[:START], first, FIRST)
     start = photo_gaussians(photos[0], poses.camera_of(0, 1), inverse).detach()
     scene = GrowingMap(poses, photos, start)
     used: list[int] = []
     errors = []
-    for i in range(len(views)):
+    for i in range(len(photos)):
         if i >= START:
             scene.track(i, TRACK)
-        if not held_out(i):
+        if views is None or not held_out(i):
             used.append(i)
             if i > 0:
                 scene.extend(i)
             scene.refine(used[-WINDOW:], REFINE_STEPS, generator)
-        if i >= 2:
+        if views is None:
+            print(f"photo {i}: {len(scene.gaussians):,} Gaussians", flush=True)
+        elif i >= 2:
             errors.append(errors_of(views[: i + 1], poses.base[: i + 1]))
             print(
                 f"photo {i}: rotations {errors[-1][0]:.2f}°, centres {errors[-1][1]:.1%}",
                 flush=True,
             )
     scene.refine(used, LAST_STEPS * len(used), generator)
-    errors.append(errors_of(views, poses.base))
+    if views is not None:
+        errors.append(errors_of(views, poses.base))
     return Found(scene, errors)
 
 
@@ -141,17 +157,42 @@ def aligned(gaussians: Gaussians, views: list[View], photos: list[Tensor]) -> li
     return renders
 
 
+def without_poses(folder: Path, most: int, side: int, seed: int, out: Path) -> None:
+    """Find the poses of a folder of photos, and write the dataset."""
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)[:most]
+    if len(files) < START:
+        raise SystemExit(f"{folder}: needs at least {START} photos")
+    read = [read_photo(file, side, None) for file in files]
+    if len({image.shape for image, _, _ in read}) > 1:
+        raise SystemExit(f"{folder}: the photos have different sizes")
+    camera, photos = read[0][1], [image.contiguous() for image, _, _ in read]
+    print(f"{len(photos)} photos of {camera.width}x{camera.height}; focal length {read[0][2]}")
+    scene = find(camera, photos, torch.Generator().manual_seed(seed), None).scene
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    for file, image in zip(files, photos, strict=True):
+        write_png(out / "images" / f"{file.stem}.png", to_8bit(image))
+    names = [f"{file.stem}.png" for file in files]
+    posed = zip(names, [pinhole_of(camera)] * len(names), scene.poses.base, strict=True)
+    xyz, rgb = scene.gaussians.means, to_8bit(scene.gaussians.base_colors[None])[0]
+    write_posed(out / "sparse" / "0", posed, xyz.double().numpy(), rgb)
+    print(f"{out}: poses and {len(xyz):,} points; next: snowsplat train {out} -o {out / 'scene'}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("dataset", type=Path)
+    parser.add_argument("dataset", type=Path, help="a dataset, or a folder of photos without poses")
     parser.add_argument("--photos", type=int, default=16, help="number of photos, at least 8")
-    parser.add_argument("-r", "--resolution", type=int, default=4, help="reduce the photos")
+    parser.add_argument("-r", "--resolution", type=int, default=4, help="reduce those of a dataset")
+    parser.add_argument("--side", type=int, default=160, help="pixels of photos without poses")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--out", type=Path, required=True)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    if not any((options.dataset / name).exists() for name in ("sparse", "transforms.json")):
+        without_poses(options.dataset, options.photos, options.side, options.seed, options.out)
+        return
     dataset = load_dataset(options.dataset, resolution=options.resolution)
     views = dataset.train[: options.photos]
     if len(views) < 8 or dataset.points is None:
@@ -160,7 +201,8 @@ def main() -> None:
     photos = [loader.get(view).over(torch.zeros(3)).contiguous() for view in views]
 
     started = time.process_time()
-    found = find(views, photos, torch.Generator().manual_seed(options.seed))
+    generator = torch.Generator().manual_seed(options.seed)
+    found = find(views[0].camera, photos, generator, views)
     seconds = time.process_time() - started
     own = [
         replace(view, camera=replace(view.camera, cam_from_world=found.scene.poses.base[i].clone()))

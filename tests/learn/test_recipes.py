@@ -9,6 +9,9 @@ from typing import Any
 import pytest
 
 from snowsplat import TrainConfig, recipe
+from snowsplat.scene.camera import NEAR
+from snowsplat.training.density import adaptive
+from snowsplat.training.parts import surfaces
 from snowsplat.training.settings.names import setting_names
 from snowsplat.training.settings.recipes import RECIPES
 
@@ -128,6 +131,56 @@ STATEMENTS: list[tuple[str, str, Check]] = [
         lambda _, default: default.antialias,
     ),
 ]
+STATEMENTS += [
+    (
+        "density-control.md",
+        "snowsplat does no reset in the last 500 steps of the densification.",
+        lambda *_: adaptive.RESET_RECOVERY == 500,
+    ),
+    (
+        "equations.md",
+        "The paper resets opacities in the text only, every 3000 steps; here `_resets_at`",
+        lambda paper, _: setting(paper, "opacity_reset_interval") == 3000,
+    ),
+    (
+        "equations.md",
+        "compares the largest scale with 1% of the scene extent",
+        lambda *both: all(setting(config, "percent_dense") == 0.01 for config in both),
+    ),
+    (
+        "surfaces.md",
+        "with `--surfaces on`: every 10 steps, the smallest scale is multiplied by 0.97",
+        lambda *_: (surfaces._INTERVAL, surfaces._SHRINK) == (10, 0.97),
+    ),
+    (
+        "camera.md",
+        "for a scene at a distance of 3 to 5 units from the cameras, it is 0.2",
+        lambda *_: NEAR == 0.2,
+    ),
+    (
+        "from-paper-to-default.md",
+        "which has 2000 steps instead of 30,000",
+        lambda paper, default: (paper.iterations, default.iterations) == (30_000, 2000),
+    ),
+]
+#: Beginnings of sentences with a number that are about shapes, files, or what was measured.
+NOT_SETTINGS = (
+    "In snowsplat, the matrix",
+    "| OpenCV |",
+    "On the CPU, snowsplat sorts",
+    "**Images.** 64 round Gaussians",
+    "**The order of `f_rest`.**",
+    "`splats` is a",
+    "What happened from 2024",
+    "The degree is the highest",
+    "Some texts count",
+    "This page follows the computation",
+    "Noise alone changes nothing here",
+    "Without the [dense initialisation",
+    "**If you have an afternoon**",
+    "| [From the paper to the default",
+    '**"Degree 3" and "order 4"',
+)
 #: Paragraphs that measure recipes, or say where they are, and state no setting.
 NO_SETTING = (
     "initialisation.md",
@@ -151,6 +204,20 @@ def test_no_statement_about_recipes_is_unchecked():
             if re.search(r"\brecipes?\b|`(default|paper|classic|mcmc)`", paragraph, re.IGNORECASE):
                 known = [text for page, text, _ in STATEMENTS if page == file.name]
                 assert any(text in paragraph for text in (*known, *NO_SETTING)), paragraph
+
+
+def test_no_number_of_the_program_is_unchecked():
+    """A sentence with a number that says what snowsplat does, or what is done "here"."""
+    for file in LEARN.glob("*.md"):
+        known = [text for page, text, _ in STATEMENTS if page == file.name]
+        for paragraph in paragraphs(file.name):
+            words = re.sub(r"\$[^$]*\$|\]\([^)]*\)|<!--.*?-->|!\[[^]]*\]", "", paragraph)
+            for sentence in re.split(r"(?<=[.!?:]) (?=[A-Z*`])", words):
+                about = re.search(r"\b[Hh]ere\b|\b[Ss]nowsplat\b", sentence)
+                if about is None or not re.search(r"\d", sentence):
+                    continue
+                covered = any(text in paragraph for text in known)
+                assert covered or sentence.startswith(NOT_SETTINGS), f"{file.name}: {sentence}"
 
 
 @pytest.mark.parametrize("page", [LEARN / WALK, DOCS / "zh" / "learn" / WALK])
