@@ -58,6 +58,12 @@ def test_a_group_that_may_have_any_size_is_found(groups, loose, camera_model):
     assert all(error > 1 for error in found.values())
 
 
+def test_points_without_observations_tell_nothing():
+    model = model_of([], points=0)
+    model.add_point3D([0.0, 0.0, 0.0], pycolmap.Track())
+    assert undetermined_photos(model) == {}
+
+
 def test_the_frame_of_the_world_has_no_effect():
     model = model_of([ONE, OTHER])
     before = undetermined_photos(model)
@@ -93,7 +99,7 @@ def test_errors_are_those_of_bundle_adjustment_with_known_rotations():
 
     frame = np.zeros((3, 3, 4))
     frame[:, :, :3], frame[:, :, 3] = np.eye(3), centres - centres[0]
-    normal = _normal_matrix(model, ids, centres, np.zeros(3))
+    normal = _normal_matrix(centres, np.full(3, FOCAL / sigma), xyz, [[0, 1, 2]] * len(xyz))
     fixed = _frame_of_one_camera_and_a_distance(_covariance(normal, frame), frame)
     assert fixed == pytest.approx(expected, rel=1e-4)
 

@@ -34,9 +34,9 @@ from snowsplat.sfm.colmap.lenses.posterior import OVERDISPERSION
 # have a wrong size.
 _DETERMINED = 1.0
 _ROUNDS = 5  # of the search for the largest group
-# Relative to the mean of the diagonal: precision of what no observation determines.
-_LEAST = 1e-14
-_LEAST_OF_POINT = 1e-12
+# Precision of what no observation determines, relative to the largest one of all positions, and to
+# that of a point: above the errors of rounding.
+_LEAST, _LEAST_OF_POINT = 1e-14, 1e-12
 
 
 def undetermined_photos(model: pycolmap.Reconstruction) -> dict[int, float]:
@@ -46,14 +46,20 @@ def undetermined_photos(model: pycolmap.Reconstruction) -> dict[int, float]:
         photos from their middle.
     """
     ids = sorted(model.reg_image_ids())
-    if len(ids) < 3 or not model.num_points3D():
+    points = [each for each in model.points3D.values() if each.track.length() > 1]
+    if len(ids) < 3 or not points:
         return {}
     centres = np.array([model.image(i).projection_center() for i in ids])
     middle = np.median(centres, 0)
     centres -= middle
     frame = np.zeros((len(ids), 3, 4))
     frame[:, :, :3], frame[:, :, 3] = np.eye(3), centres
-    covariance = _covariance(_normal_matrix(model, ids, centres, middle), frame)
+    index = {image_id: row for row, image_id in enumerate(ids)}
+    tracks = [[index[e.image_id] for e in point.track.elements] for point in points]
+    focal = np.array([pixels_per_radian(model.camera(model.image(i).camera_id)) for i in ids])
+    noise = max(1e-9, float(np.sqrt(np.mean([point.error**2 for point in points]) / 2)))
+    xyz = np.array([point.xyz for point in points]) - middle
+    covariance = _covariance(_normal_matrix(centres, focal / noise, xyz, tracks), frame)
     size = float(np.median(np.linalg.norm(centres, axis=1)))
     errors, group = _largest_group(covariance, frame, _DETERMINED * size / OVERDISPERSION)
     errors *= OVERDISPERSION / size
@@ -61,30 +67,32 @@ def undetermined_photos(model: pycolmap.Reconstruction) -> dict[int, float]:
 
 
 def _normal_matrix(
-    model: pycolmap.Reconstruction, ids: list[int], centres: Floats, middle: Floats
+    centres: Floats, precision: Floats, xyz: Floats, tracks: list[list[int]]
 ) -> Floats:
-    """(3N, 3N) of the ``centres`` (N, 3), relative to ``middle``, of the photos ``ids``."""
-    index = {image_id: row for row, image_id in enumerate(ids)}
-    points = list(model.points3D.values())
-    tracks = [[index[e.image_id] for e in point.track.elements] for point in points]
-    photo = np.concatenate([np.array(track) for track in tracks])
-    point = np.repeat(np.arange(len(points)), [len(track) for track in tracks])
-    focal = np.array([pixels_per_radian(model.camera(model.image(i).camera_id)) for i in ids])
-    ray = np.array([each.xyz for each in points])[point] - middle - centres[photo]
+    """(3N, 3N) of the ``centres`` (N, 3).
+
+    Args:
+        precision: (N,) f / σ of each photo, per radian.
+        xyz: (P, 3) points.
+        tracks: the photos of each point.
+    """
+    lengths = np.array([len(track) for track in tracks])
+    photo = np.concatenate(tracks).astype(np.intp)
+    point = np.repeat(np.arange(len(tracks)), lengths)
+    ray = xyz[point] - centres[photo]
     depth = np.linalg.norm(ray, axis=1)
-    noise = max(1e-9, float(np.sqrt(np.mean([each.error**2 for each in points]) / 2)))
+    depth = np.maximum(depth, 1e-12 * depth.max())
     ray /= depth[:, None]
     slope = np.eye(3) - ray[:, :, None] * ray[:, None, :]
     # (1 − u uᵀ) is its own square, so this is the normal matrix of each observation.
-    slope *= ((focal[photo] / (noise * depth)) ** 2)[:, None, None]
-    of_points = _sums(slope, point, len(points))
+    slope *= ((precision[photo] / depth) ** 2)[:, None, None]
+    of_points = _sums(slope, point, len(tracks))
     of_points += _LEAST_OF_POINT * np.einsum("nii->n", of_points)[:, None, None] * np.eye(3)
     root = np.linalg.inv(np.linalg.cholesky(of_points))  # LᵀL is the inverse of these
     factors = slope @ root[point].transpose(0, 2, 1)
-    count = len(ids)
+    count = len(centres)
     blocks = np.zeros((count * count, 3, 3))
     blocks[:: count + 1] = _sums(slope, photo, count)
-    lengths = np.bincount(point)
     for length in np.unique(lengths).tolist():
         rows = np.flatnonzero(lengths == length)
         which = np.searchsorted(point, rows)[:, None] + np.arange(length)
@@ -107,9 +115,9 @@ def _covariance(normal: Floats, frame: Floats) -> Floats:
     """(N, 3, N, 3) of the centres, in the frame in which all of them are fixed on average."""
     fixed, _ = np.linalg.qr(frame.reshape(len(normal), -1))
     inside = np.eye(len(normal)) - fixed @ fixed.T
-    mean = float(np.trace(normal)) / len(normal)
-    whole = inside @ normal @ inside + mean * (fixed @ fixed.T + _LEAST * np.eye(len(normal)))
-    made = np.linalg.inv(whole) - fixed @ fixed.T / mean
+    values, vectors = np.linalg.eigh(inside @ normal @ inside)
+    # The frame has the four smallest values, which are zero: it is taken out again.
+    made = inside @ (vectors / values.clip(_LEAST * values[-1])) @ vectors.T @ inside
     return np.asarray(made.reshape(len(frame), 3, len(frame), 3))
 
 
