@@ -141,15 +141,17 @@ class AttemptRunner:
             weak = f", {added} of them with weak matches" if added else ""
         check, excluded, doubts, agreement = "", dict[str, Message](), list[Message](), 0.0
         if models:
-            repaired = repair(models[0], mapping, matched.max_error)
+            others, repaired = models[1:], repair(models[0], mapping, matched.max_error)
             excluded = repaired.excluded
             check = f"; {repaired.description}" if repaired.description else ""
+            models = usable_models([repaired.model])
+        if models:
             found = settle_lens(repaired.model, self.photos, lens, mapping.with_cameras)
             mapping, doubts = dataclasses.replace(mapping, held=found.held), found.notes
             if found.model:
                 refine = mapping.with_cameras
                 model = with_all_parameters(found.model, self.photos, lens, refine, found.held)
-                models = usable_models([model, *models[1:]])
+                models = usable_models([model, *others])
             else:
                 models = []
                 check = f"; impossible: {', '.join(map(str, doubts))}"

@@ -1,7 +1,7 @@
 """Finds the photos whose positions the points of a model do not determine.
 
 If a group of photos has points in common with one other photo only, the group may have any size: it
-may grow or shrink about that photo, with the same reprojection errors. No match contradicts it, so
+may grow or shrink about that photo, with the same reprojection errors. No point contradicts it, so
 its positions are wrong, and nothing else tells.
 
 The errors of the positions are those of bundle adjustment with known rotations, which are better
@@ -33,21 +33,23 @@ from snowsplat.sfm.colmap.lenses.posterior import OVERDISPERSION
 # middle. Measured: at most 0.18 of it in 240 right models of 27 captures; 10 to 1100 in groups that
 # have a wrong size.
 _DETERMINED = 1.0
-_ROUNDS = 5  # of the search for the largest group
+# Larger models are not examined. The time grows with the cube of the number: 0.7 s for 400 photos.
+_MOST_PHOTOS = 1000
 # Precision of what no observation determines, relative to the largest one of all positions, and to
 # that of a point: above the errors of rounding.
 _LEAST, _LEAST_OF_POINT = 1e-14, 1e-12
 
 
 def undetermined_photos(model: pycolmap.Reconstruction) -> dict[int, float]:
-    """The photos whose positions have larger errors than the extent of the photos.
+    """The photos whose positions have larger errors than the extent of the photos; none of more than
+    `_MOST_PHOTOS`.
 
     Returns: image id -> standard deviation of the position, in units of the median distance of the
         photos from their middle.
     """
     ids = sorted(model.reg_image_ids())
     points = [each for each in model.points3D.values() if each.track.length() > 1]
-    if len(ids) < 3 or not points:
+    if not 3 <= len(ids) <= _MOST_PHOTOS or not points:
         return {}
     centres = np.array([model.image(i).projection_center() for i in ids])
     middle = np.median(centres, 0)
@@ -86,13 +88,14 @@ def _normal_matrix(
     slope = np.eye(3) - ray[:, :, None] * ray[:, None, :]
     # (1 − u uᵀ) is its own square, so this is the normal matrix of each observation.
     slope *= ((precision[photo] / depth) ** 2)[:, None, None]
-    of_points = _sums(slope, point, len(tracks))
+    of_points = np.zeros((len(tracks), 3, 3))
+    np.add.at(of_points, point, slope)
     of_points += _LEAST_OF_POINT * np.einsum("nii->n", of_points)[:, None, None] * np.eye(3)
     root = np.linalg.inv(np.linalg.cholesky(of_points))  # LᵀL is the inverse of these
     factors = slope @ root[point].transpose(0, 2, 1)
     count = len(centres)
     blocks = np.zeros((count * count, 3, 3))
-    blocks[:: count + 1] = _sums(slope, photo, count)
+    np.add.at(blocks, photo * (count + 1), slope)
     for length in np.unique(lengths).tolist():
         rows = np.flatnonzero(lengths == length)
         which = np.searchsorted(point, rows)[:, None] + np.arange(length)
@@ -102,13 +105,6 @@ def _normal_matrix(
                 product = factors[a] @ factors[b].transpose(0, 2, 1)
                 np.subtract.at(blocks, photo[a] * count + photo[b], product)
     return blocks.reshape(count, count, 3, 3).transpose(0, 2, 1, 3).reshape(3 * count, 3 * count)
-
-
-def _sums(values: Floats, group: NDArray[np.intp], count: int) -> Floats:
-    """(count, 3, 3) the sums of ``values`` (M, 3, 3) of each ``group`` (M,)."""
-    made = np.zeros((count, 3, 3))
-    np.add.at(made, group, values)
-    return made
 
 
 def _covariance(normal: Floats, frame: Floats) -> Floats:
@@ -135,8 +131,8 @@ def _errors(covariance: Floats, frame: Floats, photos: NDArray[np.intp]) -> Floa
 def _largest_group(
     covariance: Floats, frame: Floats, limit: float
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """The errors of all positions in the frame of the largest group whose errors are at most
-    ``limit``, and whether each photo is in this group."""
+    """The errors of all positions in the frame of the largest group of photos whose errors, in the
+    frame of two of them, are at most ``limit``; and whether those of each photo are so then."""
     group = np.ones(len(frame), bool)
     errors = _errors(covariance, frame, np.arange(len(frame)))
     if (errors <= limit).all():
@@ -149,10 +145,5 @@ def _largest_group(
             found = _errors(covariance, frame, np.array([photo, other])) <= limit
             if found.sum() > most:
                 most, group = int(found.sum()), found
-    for _ in range(_ROUNDS):
-        errors = _errors(covariance, frame, np.flatnonzero(group))
-        found = errors <= limit
-        if found.sum() < 2 or (found == group).all():
-            break
-        group = found
-    return errors, group
+    errors = _errors(covariance, frame, np.flatnonzero(group))
+    return errors, errors <= limit
