@@ -41,8 +41,7 @@ _LEAST, _LEAST_OF_POINT = 1e-14, 1e-12
 
 
 def undetermined_photos(model: pycolmap.Reconstruction) -> dict[int, float]:
-    """The photos whose positions have larger errors than the extent of the photos; none if there
-    are more than `_MOST_PHOTOS`.
+    """The photos whose positions have errors above their extent; none of more than `_MOST_PHOTOS`.
 
     Returns: image id -> standard deviation of the position, in units of the median distance of the
         photos from their middle.
