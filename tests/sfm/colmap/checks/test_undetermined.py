@@ -100,19 +100,12 @@ def test_errors_are_those_of_bundle_adjustment_with_known_rotations():
     frame = np.zeros((3, 3, 4))
     frame[:, :, :3], frame[:, :, 3] = np.eye(3), centres - centres[0]
     normal = _normal_matrix(centres, np.full(3, FOCAL / sigma), xyz, [[0, 1, 2]] * len(xyz))
-    fixed = _frame_of_one_camera_and_a_distance(_covariance(normal, frame), frame)
-    assert fixed == pytest.approx(expected, rel=1e-4)
-
-
-def _frame_of_one_camera_and_a_distance(covariance, frame):
-    """The error of the third camera, if the first one and the distance of the second are fixed."""
-    flat, whole = frame.reshape(9, 4), covariance.reshape(9, 9)
-    fixed = np.zeros((4, 9))
-    fixed[:3, :3] = np.eye(3)
-    fixed[3, 3:6] = frame[1, :, 3]
+    # The frame in which the first camera is fixed, and the distance of the second one.
+    flat, fixed = frame.reshape(9, 4), np.zeros((4, 9))
+    fixed[:3, :3], fixed[3, 3:6] = np.eye(3), away
     change = np.eye(9) - flat @ np.linalg.inv(fixed @ flat) @ fixed
-    moved = change @ whole @ change.T
-    return np.sqrt(np.trace(moved[6:9, 6:9]))
+    moved = change @ _covariance(normal, frame).reshape(9, 9) @ change.T
+    assert np.sqrt(np.trace(moved[6:9, 6:9])) == pytest.approx(expected, rel=1e-4)
 
 
 class _Mapping:
