@@ -113,3 +113,11 @@ def test_focal_lengths_of_a_bent_model_are_found_with_separate_cameras(
     job.attempts[0].models = ["a model"]
     job._try_zooms()
     assert found == [way]
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_another_mapper_is_not_tried_before_a_plane(job, flat):
+    job.evidence.flat, job.attempts = flat, [attempt(5)]
+    job.attempts[0].models = ["a model"]
+    other = next(c for c in reconstruct.CANDIDATES if c.make is PoseEstimation._try_other_mapper)
+    assert other.sensible(job) != flat

@@ -373,8 +373,8 @@ CANDIDATES = (
         PoseEstimation._try_fixed,
         again=True,
     ),
-    Candidate(
-        lambda job: not (job._good or job._hopeless),
+    Candidate(  # before a plane, the global mapper returns a wrong depth
+        lambda job: not (job._good or job._hopeless or job.evidence.flat),
         PoseEstimation._try_other_mapper,
         again=True,
     ),
