@@ -141,8 +141,13 @@ def commands() -> list[str]:
 
 
 @pytest.mark.parametrize("command", commands())
-def test_command_is_valid(command):
+def test_command_is_valid(command, tmp_path, monkeypatch):
     program, *arguments = shlex.split(command)
+    if "--import" in arguments:  # a file of one's own
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("SNOWSPLAT_IMPORT", "")
+        Path(arguments[arguments.index("--import") + 1]).with_suffix(".py").touch()
+        arguments = [f"{each}.py" if each == "FILE" else each for each in arguments]
     if program == "make":
         assert f"\n{arguments[0]}:" in (ROOT / "Makefile").read_text(encoding="utf-8")
     elif program == "snowsplat" and arguments != ["--help"]:
