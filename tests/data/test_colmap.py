@@ -314,6 +314,20 @@ def test_an_image_with_an_unknown_camera(dataset_copy):
         load_dataset(folder)
 
 
+def test_an_image_with_the_number_of_another_one_and_an_unknown_camera(dataset_copy, caplog):
+    """The tracks of the points ask for the camera of a number."""
+    folder = dataset_copy("colmap-txt")
+    images = folder / "sparse/0/images.txt"
+    lines = images.read_text().splitlines()
+    first = next(line for line in lines if not line.startswith("#"))
+    *pose, camera, _ = first.split()
+    assert camera == "1"
+    images.write_text("\n".join([*lines, " ".join([*pose, "77", "other.png"]), "", ""]))
+    with caplog.at_level(logging.WARNING, "snowsplat"):
+        dataset = load_dataset(folder)
+    assert len(dataset.train) > 1
+
+
 def test_numbers_of_the_camera_models_in_binary_files(tmp_path):
     """COLMAP's numbers, and how many parameters each model has."""
     models = {

@@ -179,6 +179,7 @@ BROKEN = {
     "means a number": lambda meta: meta.update(means=3),
     "count a word": lambda meta: meta.update(count="many"),
     "count negative": lambda meta: meta.update(count=-1),
+    "count true": lambda meta: meta.update(count=True),
     "count huge": lambda meta: meta.update(count=10**12),
     "count true size, bomb": lambda meta: meta.update(count=10**6),
     "version 9": lambda meta: meta.update(version=9),

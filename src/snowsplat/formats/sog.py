@@ -130,7 +130,7 @@ def _layout(meta: dict[str, Any]) -> _Layout:
             )
         means, scales, sh0, rest = meta["means"], meta["scales"], meta["sh0"], meta.get("shN")
         count = means["shape"][0] if version_1 else meta["count"]
-        if not isinstance(count, int) or count < 0:
+        if type(count) is not int or count < 0:  # true is an int, too
             raise Damaged("its meta.json has no valid count")
         files = dict(zip(("means_l", "means_u"), means["files"], strict=True))
         files |= {"scales": scales["files"][0], "quats": meta["quats"]["files"][0]}

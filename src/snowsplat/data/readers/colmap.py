@@ -73,7 +73,8 @@ def _tracks(model: ColmapModel, names: Mapping[int, str], file: PointFile) -> Tr
         return None
     rows = {int(image): seen[seen[:, 1] == image] for image in images}
     observed = read_observations(model, {image: track[:, 2] for image, track in rows.items()})
-    used = (image for image in model.images if image.number in names)
+    # In a damaged file, an image without a camera may have the number of another one.
+    used = (image for image in model.images if image.camera_id in model.cameras)
     cameras = {image.number: model.cameras[image.camera_id] for image in used}
     rays, points, photos, valid = [], [], [], 0
     for number, (image, track) in enumerate(rows.items()):
