@@ -69,6 +69,9 @@ def splats_in(path: Path) -> list[np.ndarray]:
     """
     import torch
 
+    with open(path, "rb") as file:
+        if not is_checkpoint(file.read(512)):  # torch would try older formats, such as tar files
+            raise Damaged("not a plausible checkpoint of PyTorch")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception:  # torch raises many kinds
