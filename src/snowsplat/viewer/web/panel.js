@@ -47,6 +47,10 @@ settings.cameras[0].initial = addView(linkedView() ?? start);
 createViewer({ container: document.body, settings, ...options }).then(viewer => {
     window.sse.viewer = viewer;
     const { app, state, events, annotations } = viewer;
+    // In orbit, at the first view. The viewer itself would begin in its animation.
+    events.on("cameraMode:changed", mode => {
+        if (mode === "anim" && !state.loaded) state.cameraMode = "orbit";
+    });
     const { camera } = app.root.findByName("camera");
     const { canvas } = app.graphicsDevice;
     const [subject, radius] = [scene.subject.slice(0, 3), scene.subject[3]];
@@ -100,6 +104,7 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
     };
 
     const begin = () => {
+        if (state.cameraMode === "anim") viewer.resetCamera(); // it was ready before this script
         hiding.set(linkedHiding() ?? scene.hiding.start);
         // The list of controls would cover the scene; a button opens it.
         document.querySelector(".sse-controlsHintClose")?.click();

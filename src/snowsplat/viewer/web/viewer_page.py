@@ -32,8 +32,6 @@ _NO_SCRIPTS = (
 )
 # Where the viewer places the scene that it has loaded.
 _PLACED = "entity.setLocalEulerAngles(0, 0, 180);"
-# The viewer begins in its animation; from there, it would fly to the first view.
-_BEGINS = "state.cameraMode = state.hasAnimation ? 'anim' :"
 # Event handlers in the HTML that the script creates: event.stopPropagation() of two buttons.
 _HANDLER = re.compile(r' on[a-z]+=\\"([^"\\]*)\\"')
 _BOOTSTRAP = '(<script type="application/json" id="sse-bootstrap">){}(</script>)'
@@ -48,21 +46,17 @@ def asset_file(name: str) -> Path:
 
 
 def asset(name: str) -> str:
-    """The content of a file of the viewer: index.html, index.css, index.js or LICENSE. The script
-    begins in orbit.
+    """The content of a file of the viewer: index.html, index.css, index.js or LICENSE.
 
     Raises: UserError: the viewer has not been unpacked in this checkout.
     """
     try:
-        text = (_FOLDER / name).read_text(encoding="utf-8")
+        return (_FOLDER / name).read_text(encoding="utf-8")
     except OSError:
         raise UserError(
             "{name}: the viewer's page is missing; in a checkout, run make native",
             name=_FOLDER / name,
         ) from None
-    return (
-        _replaced(text, _BEGINS, _BEGINS.replace("anim", "orbit")) if name == "index.js" else text
-    )
 
 
 def script(scale: float = 1.0) -> str:
