@@ -37,7 +37,7 @@ def test_words_that_are_no_subcommand(refused, scene, monkeypatch):
     assert "use convert (a file in another format) or publish" in refused("export")
     assert "publish" in refused("share")
     assert "use points (a dense cloud), or mesh" in refused("pointcloud")
-    assert f"snowsplat make {scene}; or: snowsplat info {scene}" in refused(scene)
+    assert f"snowsplat view {scene}; or: snowsplat info {scene}" in refused(scene)
     for hint, words in _WORDS.items():
         assert re.match(r"use (\w+)", hint)[1] in SUBCOMMANDS
         assert not set(words.split()) & set(SUBCOMMANDS)

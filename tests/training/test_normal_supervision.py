@@ -32,6 +32,7 @@ from .sphere import cameras, dataset, rays, resumed_with_the_same_bits, z_of_sph
 
 CONFIG = replace(
     recipe("default", iterations=60, init="points", max_gaussians=600, transients="off", sky=False),
+    exposure="off",
     coarse_to_fine=(0.0, 0.0),
     few_passes=0.0,
     depth_weight=1.0,

@@ -62,7 +62,7 @@ def test_html_files_cannot_be_read(tmp_path):
 
 def test_the_page_is_listed_among_the_formats_to_write(tmp_path):
     with pytest.raises(UserError, match=r"use one of .*\.html"):
-        write_gaussians(tmp_path / "scene.obj", three_balls())
+        write_gaussians(tmp_path / "scene.abc", three_balls())
 
 
 def test_scenes_without_a_page(tmp_path, monkeypatch):

@@ -78,7 +78,7 @@ def test_a_walk_straight_ahead(tmp_path):
     walk = walks.forward()
     (tmp_path / "before").mkdir()
     assert mapped(tmp_path / "before", walk, None, Lens())[0] == []
-    (model,), _ = mapped(tmp_path, walk, 500.0, Lens().fixed, forward=True)
+    (model,), _ = mapped(tmp_path, walk, 500.0, Lens(held=True), forward=True)
     assert model.num_reg_images() == len(walk.centres)
     images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda i: i.name)
     centres = np.array([image.projection_center() for image in images])
@@ -89,8 +89,8 @@ def test_a_walk_straight_ahead(tmp_path):
 
 def test_photos_that_do_not_determine_the_focal_length_keep_that_of_exif(tmp_path):
     walk = walks.forward()
-    (model,), refine = mapped(tmp_path, walk, 500.0, Lens().fixed, forward=True)
-    found = settle_lens(model, walk.photos(500.0), Lens().fixed, refine)
+    (model,), refine = mapped(tmp_path, walk, 500.0, Lens(held=True), forward=True)
+    found = settle_lens(model, walk.photos(500.0), Lens(held=True), refine)
     assert found.held
     assert found.notes == []
     assert found.model.cameras[1].mean_focal_length() == 500.0
@@ -141,7 +141,7 @@ def test_a_panorama_is_kept_as_it_is(tmp_path):
 def test_an_impossible_lens_is_replaced(tmp_path):
     """Pixels that are not square, and a distortion that no lens has."""
     walk = walks.forward()
-    (model,), refine = mapped(tmp_path, walk, 500.0, Lens().fixed, forward=True)
+    (model,), refine = mapped(tmp_path, walk, 500.0, Lens(held=True), forward=True)
     camera = model.cameras[1]
     camera.model = pycolmap.CameraModelId.OPENCV
     camera.params = [480.0, 460.0, 320.0, 240.0, 0.9, -1.2, 0.0, 0.0]
