@@ -71,7 +71,7 @@ def splats_in(path: Path) -> list[np.ndarray]:
 
     with open(path, "rb") as file:
         if not is_checkpoint(file.read(512)):  # torch would try older formats, such as tar files
-            raise Damaged("not a plausible checkpoint of PyTorch")
+            raise Damaged("a checkpoint that cannot be loaded safely, or a damaged one")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception:  # torch raises many kinds
