@@ -55,6 +55,11 @@ def test_files(site, scene):
     assert poster[:, :40].max() < 20
 
 
+def test_without_cameras_nobody_walks(scene, tmp_path, refused):
+    assert "needs the cameras" in refused("publish", scene, "-o", tmp_path / "site", "--walk")
+    assert not (tmp_path / "site").exists()
+
+
 def test_page(site):
     text = (site / "index.html").read_text(encoding="utf-8")
     tags = dict(re.findall(r'<meta property="([^"]+)" content="([^"]*)"', text))

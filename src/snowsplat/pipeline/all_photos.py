@@ -24,7 +24,7 @@ from snowsplat.scene.render import render
 from snowsplat.training.core.history import History
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
-from snowsplat.training.parts.list import parts_of, registered_parts
+from snowsplat.training.parts.list import all_parts_of
 from snowsplat.training.parts.transients import KnownTransients
 from snowsplat.training.parts.unexplained import unexplained_views
 from snowsplat.training.settings.config import TrainConfig
@@ -91,11 +91,7 @@ def train_on_all(
         config,
         device=background.device,
         initial=scene.gaussians.clone(),
-        parts=[
-            *parts_of(config),
-            *registered_parts(),
-            *([KnownTransients()] if folder.masks.is_dir() else []),
-        ],
+        parts=[*all_parts_of(config), *([KnownTransients()] if folder.masks.is_dir() else [])],
     )
     exposure = trainer.part(Exposure)
     if exposure is not None:

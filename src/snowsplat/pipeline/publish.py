@@ -89,7 +89,6 @@ def publish(
         observer.inform(
             "the page does not know the place of the scene, the origin {place}", place=place
         )
-    folder.mkdir(parents=True, exist_ok=True)
     if options.for_editing:
         # A Gaussian of which only these colours are not finite is left out, too.
         usable = source.gaussians.select(source.gaussians.usable_rows())
@@ -97,7 +96,9 @@ def publish(
     large = len(source.gaussians) > _LARGE and not options.for_editing
     write = partial(_write_levels, observer) if large else write_one_file
     with observer.waiting("writing"):
-        write_site(folder, source.ready(walk=options.walk), about, url, write)
+        scene_of_page = source.ready(walk=options.walk)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_site(folder, scene_of_page, about, url, write)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return PublishResult(folder, len(source.gaussians), size)
 

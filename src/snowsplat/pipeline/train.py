@@ -33,7 +33,7 @@ from snowsplat.training.core import checkpoint
 from snowsplat.training.core.checkpoint import Checkpoint
 from snowsplat.training.core.run import Loss
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.list import hints, parts_of, registered_parts
+from snowsplat.training.parts.list import all_parts_of, hints
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.config import TrainConfig
@@ -299,7 +299,7 @@ class _Job:
             self.device,
             state,
             shards=self.shards,
-            parts=[*parts_of(config), *registered_parts(), *self.request.parts],
+            parts=[*all_parts_of(config), *self.request.parts],
             loss=self.request.loss,
             note=self.note,
         )

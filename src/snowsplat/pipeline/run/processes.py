@@ -178,7 +178,7 @@ def follow(
     from snowsplat.data import read_dataset
     from snowsplat.training.core.checkpoint import load
     from snowsplat.training.core.trainer import Trainer
-    from snowsplat.training.parts.list import parts_of, registered_parts
+    from snowsplat.training.parts.list import all_parts_of
     from snowsplat.training.step.finite import Diverged
 
     setup = shards.of_first(None)
@@ -191,7 +191,7 @@ def follow(
         device,
         state,
         shards=shards,
-        parts=[*parts_of(setup.config), *registered_parts(), *parts],
+        parts=[*all_parts_of(setup.config), *parts],
         loss=loss,
     )
     together = Collective(trainer)

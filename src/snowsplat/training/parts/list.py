@@ -29,7 +29,7 @@ _REGISTERED: list[Callable[[], Part]] = []
 
 
 def register_part(make: _Factory) -> _Factory:
-    """Let a part take part in all trainings of this process; also a decorator of a class.
+    """Let a part take part in the trainings of `train` and `make`; also a decorator of a class.
 
     ``make``: called without arguments for each training.
     """
@@ -37,9 +37,9 @@ def register_part(make: _Factory) -> _Factory:
     return make
 
 
-def registered_parts() -> list[Part]:
-    """New objects of the parts of `register_part`; they come after those of `parts_of`."""
-    return [make() for make in _REGISTERED]
+def all_parts_of(config: TrainConfig) -> list[Part]:
+    """Those of `parts_of`, and after them new objects of the parts of `register_part`."""
+    return [*parts_of(config), *(make() for make in _REGISTERED)]
 
 
 def parts_of(config: TrainConfig) -> list[Part]:

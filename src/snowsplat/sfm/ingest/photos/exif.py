@@ -155,7 +155,7 @@ def read_exif(
         orientation=orientation,
         camera=" ".join([*filter(None, named), *(f"{f:g} mm" for f in zoom if f)]),
         focal=_focal(details, width, height),
-        cropped=_uncropped(details, width, height) != (max(width, height), min(width, height)),
+        cropped=_is_cropped(details, width, height),
         location=location,
         location_error=location_error,
         attitude=read_attitude(exif, details, gps, xmp, taken or orientation),
@@ -212,6 +212,10 @@ def _uncropped(details: Mapping[int, Any], width: int, height: int) -> tuple[flo
     return None if scale > 1.0 else (scale * original[0], scale * original[1])
 
 
+def _is_cropped(details: Mapping[int, Any], width: int, height: int) -> bool:
+    return _uncropped(details, width, height) != (max(width, height), min(width, height))
+
+
 def _ifd(exif: Image.Exif, tag: int) -> Mapping[int, Any]:
     try:
         return exif.get_ifd(tag)
@@ -229,7 +233,7 @@ def exif_for_copy(exif: Image.Exif, width: int, height: int) -> bytes:
         copy.load(exif.tobytes())
         copy[Base.Orientation] = 1
         details = copy.get_ifd(IFD.Exif)
-        if _uncropped(details, width, height) != (max(width, height), min(width, height)):
+        if _is_cropped(details, width, height):
             details.pop(Base.FocalLengthIn35mmFilm, None)  # of the whole photo
         # A maker note contains offsets into the old file. The pixels per unit may have changed.
         plane = (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
