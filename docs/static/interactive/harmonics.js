@@ -1,17 +1,7 @@
 // Spherical harmonics: a function on the sphere, and its approximation degree by degree.
 (() => {
   "use strict";
-  const { add, choice, signed, t, figure } = interactive;
-  function basis(x, y, z) { // the 16 functions of the page, in its order and with its signs
-    const xx = x * x, yy = y * y, zz = z * z;
-    return [0.28209479, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x,
-      1.09254843 * x * y, -1.09254843 * y * z, 0.31539157 * (2 * zz - xx - yy),
-      -1.09254843 * x * z, 0.54627422 * (xx - yy),
-      -0.59004359 * y * (3 * xx - yy), 2.89061144 * x * y * z,
-      -0.45704580 * y * (4 * zz - xx - yy), 0.37317633 * z * (2 * zz - 3 * xx - 3 * yy),
-      -0.45704580 * x * (4 * zz - xx - yy), 1.44530572 * z * (xx - yy),
-      -0.59004359 * x * (xx - 3 * yy)];
-  }
+  const { add, basis, choice, signed, t, figure } = interactive;
   // Directions that are evenly distributed (a Fibonacci lattice), for integrals over the sphere.
   const COUNT = 4000, lattice = Array.from({ length: COUNT }, (_, i) => {
     const z = 1 - (2 * i + 1) / COUNT, r = Math.sqrt(1 - z * z), a = i * Math.PI * (3 - Math.sqrt(5));

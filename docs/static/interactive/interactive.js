@@ -136,8 +136,19 @@
       "试一试：找一个被克隆的高斯和一个被分裂的高斯。哪个更大？"),
   };
   const figures = {};
-  window.interactive = { add, slider, choice, tick, button, plot, text, path, ellipse, eigen,
-    signed, t, load, figure: (name, draw) => { figures[name] = draw; } };
+  function basis(x, y, z) { // the 16 spherical harmonics of the course, in its order and with its signs
+    const xx = x * x, yy = y * y, zz = z * z;
+    return [0.28209479, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x,
+      1.09254843 * x * y, -1.09254843 * y * z, 0.31539157 * (2 * zz - xx - yy),
+      -1.09254843 * x * z, 0.54627422 * (xx - yy),
+      -0.59004359 * y * (3 * xx - yy), 2.89061144 * x * y * z,
+      -0.45704580 * y * (4 * zz - xx - yy), 0.37317633 * z * (2 * zz - 3 * xx - 3 * yy),
+      -0.45704580 * x * (4 * zz - xx - yy), 1.44530572 * z * (xx - yy),
+      -0.59004359 * x * (xx - 3 * yy)];
+  }
+
+  window.interactive = { add, basis, slider, choice, tick, button, plot, text, path,
+    ellipse, eigen, signed, t, load, figure: (name, draw) => { figures[name] = draw; } };
   const loaded = {};
   function load(file) { // a script of this folder, once
     return loaded[file] ??= new Promise((done, failed) => {

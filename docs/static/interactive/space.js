@@ -2,7 +2,7 @@
 // same object, and keep its orientation from page to page.
 (() => {
   "use strict";
-  const { add, slider, tick, signed, t, load, figure } = interactive;
+  const { add, basis, slider, tick, signed, t, load, figure } = interactive;
   const SIZE = 330, DISTANCE = 4, FOCAL = 1.45 * SIZE, C0 = 0.28209479;
 
   // The data: see docs/learn/figures/interactive_space.py.
@@ -36,16 +36,6 @@
       [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]];
     const entry = (i, j) => scales.reduce((sum, s, k) => sum + R[i][k] * R[j][k] * s * s, 0);
     return [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)];
-  }
-  function basis(x, y, z) { // the functions of the degrees 1 to 3
-    const xx = x * x, yy = y * y, zz = z * z;
-    return [-0.48860251 * y, 0.48860251 * z, -0.48860251 * x,
-      1.09254843 * x * y, -1.09254843 * y * z, 0.31539157 * (2 * zz - xx - yy),
-      -1.09254843 * x * z, 0.54627422 * (xx - yy),
-      -0.59004359 * y * (3 * xx - yy), 2.89061144 * x * y * z,
-      -0.45704580 * y * (4 * zz - xx - yy), 0.37317633 * z * (2 * zz - 3 * xx - 3 * yy),
-      -0.45704580 * x * (4 * zz - xx - yy), 1.44530572 * z * (xx - yy),
-      -0.59004359 * x * (xx - 3 * yy)];
   }
 
   // The projection is that of the course: Σ' = J W Σ Wᵀ Jᵀ + 0.3 I.
@@ -181,7 +171,7 @@
     const color = [0, 1, 2].map(k => 0.5 + C0 * stage.dc[3 * i + k]);
     if (degree > 0) {
       const v = [0, 1, 2].map(k => stage.mean[3 * i + k] - camera[k]), n = Math.hypot(...v);
-      const y = basis(v[0] / n, v[1] / n, v[2] / n).slice(0, (degree + 1) ** 2 - 1);
+      const y = basis(v[0] / n, v[1] / n, v[2] / n).slice(1, (degree + 1) ** 2);
       for (let k = 0; k < 3; k++)
         y.forEach((value, j) => { color[k] += value * stage.rest[45 * i + 15 * k + j]; });
     }
