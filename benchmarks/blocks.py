@@ -13,7 +13,6 @@ import argparse
 import json
 import math
 import multiprocessing
-import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from street_dataset import write_street_dataset
 
 from snowsplat.data import ImageLoader, View
 from snowsplat.pipeline.blocks.plan import Plan, plan_blocks
@@ -34,14 +34,10 @@ from snowsplat.pipeline.render import evaluate
 from snowsplat.pipeline.train import train
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
-from snowsplat.scene.render import render
+from snowsplat.scene.render import render, to_8bit
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.files import write_json
 from snowsplat.util.machine import peak_bytes, reset_peak, resident_bytes
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from street_dataset import write_street_dataset
 
 WORST = 6
 
@@ -91,8 +87,7 @@ def walk(length: float, camera: Camera, frames: int) -> Iterator[Camera]:
 def rendered(scene: TrainedScene, camera: Camera) -> np.ndarray:
     """(H, W, 3) uint8."""
     with torch.no_grad():
-        image = render(scene.gaussians, camera.to(scene.gaussians.means.device)).image
-    return image.clamp(0, 1).mul(255).round().to(torch.uint8).cpu().numpy()
+        return to_8bit(render(scene.gaussians, camera.to(scene.gaussians.means.device)).image)
 
 
 def write_film(file: Path, whole: TrainedScene, merged: TrainedScene, frames: int) -> None:
@@ -108,18 +103,11 @@ def write_pictures(
     file: Path, views: list[View], whole: TrainedScene, merged: TrainedScene
 ) -> None:
     """A row for each view: the photo, the whole, the merged blocks."""
+    rows = []
     with ImageLoader(views) as loader:
-        rows = [
-            np.concatenate(
-                [
-                    loader.get(view).rgb.numpy(),
-                    rendered(whole, view.camera),
-                    rendered(merged, view.camera),
-                ],
-                axis=1,
-            )
-            for view in views
-        ]
+        for view in views:
+            drawn = [rendered(scene, view.camera) for scene in (whole, merged)]
+            rows.append(np.concatenate([loader.get(view).rgb.numpy(), *drawn], axis=1))
     Image.fromarray(np.concatenate(rows)).save(file)
 
 

@@ -12,7 +12,6 @@ motion finds them. The true depth of the held-out photos is compared with the re
 from __future__ import annotations
 
 import argparse
-import ast
 import itertools
 import json
 import resource
@@ -22,22 +21,20 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from tests.scenes.depth import depth_map
 from torch.nn.functional import interpolate, normalize
+from traced import depth_map, write_traced
+from train import setting
 
 from snowsplat import Trainer, load_dataset, recipe
-from snowsplat.data.colmap.model import write_posed
-from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import invert_rigid
 from snowsplat.scene.render import render
 from snowsplat.scene.surface_normals import normals_of_depth
-from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
+from snowsplat.synthetic.photographer import phone_lens, walk
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.training.parts.normal_supervision import NormalSupervision
 
-#: Points per photo, and their error relative to the depth.
-POINTS, POINT_ERROR = 60, 0.004
+#: Points per photo, and their error in metres.
+POINTS, POINT_ERROR = 60, 0.006
 KINDS = ("none", "true", "scaled", "wrong")
 NORMALS = ("none", "true", "noisy", "wrong", "axes")
 
@@ -48,22 +45,11 @@ def write_room(folder: Path, views: int, width: int, height: int) -> None:
         return
     lens = phone_lens(width, height, (0.0, 0.0, 0.0, 0.0))
     scene = still_life(0)
-    truth = take_photos(folder / "images", lambda: scene, lens, walk(views, 0), 0)
+    poses = walk(views, 0)
+    write_traced(folder, lambda: scene, lens, poses, points=POINTS, error=POINT_ERROR)
     (folder / "truth").mkdir(exist_ok=True)
-    random, points = np.random.default_rng(0), []
-    for name, pose in truth.poses.items():
-        z = depth_map(scene, lens, pose)
-        np.save(folder / "truth" / f"{Path(name).stem}.npy", z)
-        y, x = random.integers(0, height, POINTS), random.integers(0, width, POINTS)
-        seen = z[y, x] * (1.0 + POINT_ERROR * random.standard_normal(POINTS))
-        cam = np.stack([x + 0.5 - width / 2, y + 0.5 - height / 2, np.full(POINTS, lens.focal)])
-        world = invert_rigid(pose).numpy()
-        points.append((world[:, :3] @ (cam / lens.focal * seen)).T + world[:, 3])
-    xyz = np.concatenate(points)
-    pinhole = lens_of("PINHOLE", width, height, (lens.focal, lens.focal, width / 2, height / 2))
-    grey = np.full(xyz.shape, 128, np.uint8)
-    posed = [(name, pinhole, pose) for name, pose in truth.poses.items()]
-    write_posed(folder / "sparse" / "0", posed, xyz, grey)
+    for i, pose in enumerate(poses, 1):
+        np.save(folder / "truth" / f"IMG_{i:04d}.npy", depth_map(scene, lens, pose))
 
 
 def write_maps(folder: Path, kind: str) -> None:
@@ -153,7 +139,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=800)
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE")
     args = parser.parse_args()
-    settings = {name: ast.literal_eval(value) for name, value in (s.split("=") for s in args.set)}
+    settings = dict(setting(text) for text in args.set)
     room = args.output / "room"
     write_room(room, args.views, *args.size)
     for kind, normals in itertools.product(args.maps, args.normals):

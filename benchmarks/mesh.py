@@ -174,7 +174,7 @@ def output_of(name: str, options: argparse.Namespace) -> Path:
 def measured(name: str, scene: Procedural, options: argparse.Namespace) -> None:
     truth_file = options.out / f"{name}_truth.npz"
     if not truth_file.exists():
-        found = true_points(scene.build(), scene, options.width, options.points)
+        found = true_points(scene, options.width, options.points)
         np.savez_compressed(truth_file, one=found[0], two=found[1])
     with np.load(truth_file) as stored:
         truth = stored["one"], stored["two"]

@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
-from tests.scenes.depth import distances
 from torch import Tensor
+from traced import distances
 
 from snowsplat.scene.geometry import invert_rigid
 from snowsplat.synthetic import textures as paint
-from snowsplat.synthetic.photographer import RAYS, CentredLens, develop, tiles
+from snowsplat.synthetic.photographer import CentredLens, photograph
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import FLOOR, LAMP
@@ -56,35 +56,25 @@ def _person(cam_from_world: Tensor, number: int, seed: int) -> Scene:
     return Scene(figure, LAMP)
 
 
-def photograph(
-    scene: Scene,
-    lens: CentredLens,
-    cam_from_world: Tensor,
-    random: np.random.Generator,
-    passing: Scene | None = None,
-) -> np.ndarray:
-    """`snowsplat.synthetic.photographer.photograph` with someone who passes.
+class _Passed(Scene):
+    """A scene with more objects, which cast no shadow on it."""
 
-    ``passing``: more objects, which cast no shadow on the scene.
-    """
-    world_from_cam = invert_rigid(cam_from_world).numpy()
-    rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
-    spread = 1 / (lens.focal * RAYS)
-    light = np.empty((lens.height, lens.width, 3), np.float32)
-    for rows, columns, rays in tiles(lens):
-        directions = rotation @ rays
-        found = scene.radiance(origin, directions, spread)
-        if passing is not None:
-            near = distances(passing, origin, directions) < distances(scene, origin, directions)
-            found = np.where(near, passing.radiance(origin, directions, spread), found)
-        shape = (3, rows.stop - rows.start, RAYS, columns.stop - columns.start, RAYS)
-        pixels = found.clip(0, 1).reshape(shape).mean(axis=(2, 4))
-        light[rows, columns] = pixels.transpose(1, 2, 0)
-    return develop(light, random)
+    def __init__(self, scene: Scene, passing: Scene) -> None:
+        self._scenes = scene, passing
+
+    def radiance(self, origins: np.ndarray, directions: np.ndarray, spread: float) -> np.ndarray:
+        scene, passing = (each.radiance(origins, directions, spread) for each in self._scenes)
+        far, near = (distances(each, origins, directions) for each in self._scenes)
+        return np.where(near < far, passing, scene)
 
 
 def shooting(
     lens: CentredLens, poses: Sequence[Tensor], passing: Mapping[int, Scene]
 ) -> Callable[[Scene, int, np.random.Generator], np.ndarray]:
     """For `take_photos`; ``passing``: who is in only one photo, by the index of its pose."""
-    return lambda scene, i, random: photograph(scene, lens, poses[i], random, passing.get(i))
+
+    def shoot(scene: Scene, i: int, random: np.random.Generator) -> np.ndarray:
+        shown = _Passed(scene, passing[i]) if i in passing else scene
+        return photograph(shown, lens, poses[i], random)
+
+    return shoot

@@ -60,16 +60,8 @@ def run(dataset: Path, minutes: float, settings: list[str], folder: Path) -> Res
     # The training may have reduced the photos.
     subprocess.run([*command, "evaluate", str(folder), "-r", "1"], check=True)
     found = json.loads((folder / "metrics.json").read_text())
-    return Result(
-        dataset.name,
-        minutes,
-        found["psnr"],
-        found["ssim"],
-        found["size"],
-        found["iteration"],
-        seconds,
-        load,
-    )
+    judged = [found[name] for name in ("psnr", "ssim", "size", "iteration")]
+    return Result(dataset.name, minutes, *judged, seconds, load)
 
 
 def _children_seconds() -> float:

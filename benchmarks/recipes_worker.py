@@ -12,14 +12,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor
+from train import milestones
 
 from snowsplat import Dataset, Trainer, UserError, load_dataset, ops, recipe
 from snowsplat.data.photos.image_loader import ImageLoader
-from snowsplat.scene.render import project, render
+from snowsplat.scene.render import project, render, to_8bit
 from snowsplat.training.core.view_queue import FIXED_BACKGROUNDS
 from snowsplat.training.settings.stored import config_to_json
 
@@ -59,11 +58,6 @@ def pairs_per_pixel(trainer: Trainer) -> float:
         splats = project(trainer.gaussians, camera)
         counts.append(float(ops.count_blended(splats, camera.width, camera.height).mean()))
     return sum(counts) / len(counts)
-
-
-def milestones(iterations: int, count: int) -> list[int]:
-    """Steps at which to evaluate, at growing distances: every second one doubles the step."""
-    return sorted({max(1, round(iterations * 2.0 ** (-i / 2))) for i in range(count)})
 
 
 def train(request: dict[str, Any]) -> dict[str, Any]:
@@ -111,14 +105,8 @@ def save_pictures(trainer: Trainer, folder: Path) -> None:
     with ImageLoader(views) as loader:
         for i, view in enumerate(views):
             image = render(trainer.gaussians, view.camera, background).image
-            save(folder / f"{i}.png", image)
-            save(folder / f"{i}-photo.png", loader.get(view).over(background))
-
-
-def save(path: Path, image: Tensor) -> None:
-    """An (H, W, 3) image in 0..1 as PNG."""
-    pixels = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).contiguous().numpy()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(path)
+            for name, each in ((f"{i}", image), (f"{i}-photo", loader.get(view).over(background))):
+                Image.fromarray(to_8bit(each)).save(folder / f"{name}.png")
 
 
 def main() -> None:

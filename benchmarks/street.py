@@ -7,6 +7,7 @@ the seed. The sky and a distant skyline are painted on a dome.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -28,10 +29,10 @@ _PLANE_LEAVES = ((0.28, 0.42, 0.16), (0.36, 0.46, 0.18), (0.22, 0.36, 0.17))
 _METAL = (0.16, 0.19, 0.20)
 
 
-def street(length: float, seed: int = 0) -> Scene:
-    """The scene with its illumination; equal arguments produce equal scenes."""
+def street(length: float, seed: int = 0, more: Sequence[SceneObject] = ()) -> Scene:
+    """The scene with its illumination, and ``more``; equal arguments produce equal scenes."""
     random = np.random.default_rng(seed)
-    objects = [_surroundings(length, random), _ground_box(length, random)]
+    objects = [*more, _surroundings(length, random), _ground_box(length, random)]
     for side in (-1, 1):
         objects += _houses(length, side, random)
         objects += _pavement(length, side, random)

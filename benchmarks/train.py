@@ -99,7 +99,7 @@ def _peak_mb() -> float:
 
 def main() -> None:
     flags = _flags()
-    settings = dict(_setting(text) for text in flags.set)
+    settings = dict(setting(text) for text in flags.set)
     if flags.threads:
         ops.set_num_threads(flags.threads)
     start = _peak_mb()
@@ -151,7 +151,7 @@ def _write(flags: argparse.Namespace, rows: list[Milestone], settings: dict[str,
     print(f"{stem}.csv, .json, .svg")
 
 
-def _setting(text: str) -> tuple[str, Any]:
+def setting(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         raise UserError(f"--set {text}: write it as NAME=VALUE")
