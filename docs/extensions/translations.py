@@ -27,6 +27,7 @@ _DOCS = Path(__file__).resolve().parents[1]
 #: Pages of `docs/` that are translated, as patterns.
 TRANSLATED = (
     "installation.md",
+    "questions.md",
     "quick-start.md",
     "guides/anamorph.md",
     "guides/globe.md",

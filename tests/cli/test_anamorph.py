@@ -24,7 +24,7 @@ def test_what_it_made_is_named(run, pictures, tmp_path, monkeypatch):
     result = run("anamorph", *pictures, "-o", out, *SMALL, "--shape", "solid", "--overwrite")
     assert result.code == 0, result.err
     assert "个高斯" in result.out
-    assert f"snowsplat mesh {out} -o {out / 'mesh.ply'} --fill-holes" in result.out
+    assert f"snowsplat mesh {out} -o {out / 'mesh.ply'} --gaussians-only" in result.out
 
 
 def test_errors(refused, pictures, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from snowsplat.surface.volume import (
     zero_level,
 )
 
+Sphere = tuple[list[DepthMap], Volume]
 _UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 
 
@@ -43,14 +45,14 @@ def _of_sphere(camera: Camera, radius: float) -> DepthMap:
 
 
 @pytest.fixture(scope="module")
-def sphere() -> tuple[list[DepthMap], Volume]:
+def sphere() -> Sphere:
     directions = [*np.eye(3), *-np.eye(3)]
     maps = [_of_sphere(_camera(tuple(3 * d + 0.01), 128), 0.6) for d in directions]
     keys = occupied_blocks(maps, 0.04)
     return maps, fuse_maps(maps, 0.04, keys, lambda *_: None)
 
 
-def test_a_sphere_is_accurate_and_nearly_closed(sphere: tuple[list[DepthMap], Volume]) -> None:
+def test_a_sphere_is_accurate_and_nearly_closed(sphere: Sphere) -> None:
     vertices, faces = zero_level(sphere[1], 0.1)
     radius = np.linalg.norm(vertices, axis=1)
     assert np.abs(radius - 0.6).mean() < 0.008  # a fifth of a voxel
@@ -65,9 +67,7 @@ def test_a_sphere_is_accurate_and_nearly_closed(sphere: tuple[list[DepthMap], Vo
     assert largest_parts(faces, len(vertices), 0.5).all()
 
 
-def test_colours_come_from_the_photos_that_show_a_vertex(
-    sphere: tuple[list[DepthMap], Volume],
-) -> None:
+def test_colours_come_from_the_photos_that_show_a_vertex(sphere: Sphere) -> None:
     maps, volume = sphere
     vertices, faces = zero_level(volume, 0.1)
     shades = (0, 50, 100, 150, 200, 250)
@@ -88,9 +88,7 @@ def test_block_keys() -> None:
 
 def _wall(tilt: float) -> Gaussians:
     """Flat, opaque Gaussians in the plane z = tan(tilt) x, larger than their distance."""
-    x, y = (
-        c.reshape(-1) for c in torch.meshgrid(*[torch.linspace(-1.5, 1.5, 13)] * 2, indexing="ij")
-    )
+    x, y = torch.cartesian_prod(*[torch.linspace(-1.5, 1.5, 13)] * 2).T
     n = len(x)
     half = -tilt / 2  # about y: x turns towards z
     return Gaussians(
@@ -115,16 +113,13 @@ def test_depth_of_a_tilted_wall(degrees: int) -> None:
         1.0 - math.tan(tilt) * across * x
     )  # z = −3 + depth = tan(tilt) across x depth
     inner = slice(24, 40)
-    error = (found.depth[inner, inner] / expected[inner] - 1).abs()
-    assert float(error.max()) < 0.003
-    cosine = found.confidence[32, 32]
-    assert abs(float(cosine) - math.cos(tilt)) < 0.1
+    assert float((found.depth[inner, inner] / expected[inner] - 1).abs().max()) < 0.003
+    assert float(found.confidence[32, 32]) == pytest.approx(math.cos(tilt), abs=0.1)
     assert not SurfaceRenderer(_wall(tilt)).render(camera, 1.0).depth[inner, inner].isfinite().any()
 
 
 def test_what_the_photo_says() -> None:
-    camera = _camera((0.0, 0.0, -3.0), 4)
-    found = SurfaceRenderer(_wall(0.0)).render(camera)
+    found = SurfaceRenderer(_wall(0.0)).render(_camera((0.0, 0.0, -3.0), 4))
     left = torch.arange(4).expand(4, 4) < 2
     corrected = found.corrected(empty=left, usable=torch.arange(4)[:, None].expand(4, 4) < 2)
     assert corrected.depth[0, :2].isinf().all()
@@ -152,6 +147,16 @@ def test_holes_are_filled_and_the_outer_border_is_not() -> None:
     assert len(filled) == 65
     assert len(triangles) == len(faces) + 4
     assert (vertex_normals(filled, triangles)[:, 2] == vertex_normals(vertices, faces)[0, 2]).all()
+
+
+def test_all_holes_of_a_closed_surface_are_filled_also_beside_a_fin() -> None:
+    """A cube without two triangles, and a third triangle on one of its edges."""
+    vertices = np.float32([*np.ndindex(2, 2, 2), (0, -1, 0)])
+    sides = [0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]
+    faces = [(a, *rest) for a, b, c, d in sides for rest in ((b, c), (c, d))]
+    _, triangles = filled_holes(vertices, np.array([*faces[1:5], *faces[6:], (0, 4, 8)]))
+    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()
+    assert Counter(map(tuple, edges)) == Counter((b, a) for a, b in edges)
 
 
 def test_small_parts() -> None:

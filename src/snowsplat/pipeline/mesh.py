@@ -31,7 +31,6 @@ from snowsplat.formats import mesh_files
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.scene import MeshOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene
-from snowsplat.scene.camera import Camera
 from snowsplat.scene.mesh import Mesh, compact_mesh, filled_holes, largest_parts, vertex_normals
 from snowsplat.scene.orientation import scene_up
 from snowsplat.surface.colors import vertex_colors
@@ -149,9 +148,10 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
         with observer.waiting("depth") as report:
             maps, far = _depth_maps(scene, views, options, report)
         return_unused()  # temporary tensors of the photos; here and after the next stages
-        with observer.waiting("stereo") as report:
-            confirm_by_photos(views, maps, far, report)
-        return_unused()
+        if not options.gaussians_only:
+            with observer.waiting("stereo") as report:
+                confirm_by_photos(views, maps, far, report)
+            return_unused()
         with observer.waiting("fusion") as report:
             voxel, keys, closer = _voxel(maps, options)
             if not len(keys):
@@ -193,7 +193,8 @@ def _depth_maps(
     far = options.far
     if far is None:
         sample = cameras[:: math.ceil(len(cameras) / _SAMPLE_VIEWS)]
-        far = _REACH * _usual_depth([renderer.render(_small(camera)) for camera in sample])
+        small = [each.scaled(max(1, each.width // 4), max(1, each.height // 4)) for each in sample]
+        far = _REACH * _usual_depth([renderer.render(camera) for camera in small])
     partial = [
         view.mask is not None or view.image.path.suffix.lower() not in _OPAQUE for view in views
     ]
@@ -212,10 +213,6 @@ def _depth_maps(
     return maps, far
 
 
-def _small(camera: Camera) -> Camera:
-    return camera.scaled(max(1, camera.width // 4), max(1, camera.height // 4))
-
-
 def _usual_depth(maps: Sequence[DepthMap]) -> float:
     """The median, over views, of the median depth. Raises UserError: no view shows a surface."""
     medians = []
@@ -229,16 +226,11 @@ def _usual_depth(maps: Sequence[DepthMap]) -> float:
     return float(np.median(medians))
 
 
-def _focal(maps: Sequence[DepthMap]) -> float:
-    return float(np.median([each.camera.fx for each in maps]))
-
-
 def _voxel(maps: Sequence[DepthMap], options: MeshOptions) -> tuple[float, np.ndarray, bool]:
     """The side of a voxel, the blocks near a surface, and whether memory has limited the former."""
-    voxel = options.voxel
-    if voxel is None:
-        voxel = _VOXEL_PIXELS * _usual_depth(maps) / _focal(maps)
-    elif voxel < _SMALLEST_VOXEL * (pixel := _usual_depth(maps) / _focal(maps)):
+    pixel = _usual_depth(maps) / float(np.median([each.camera.fx for each in maps]))
+    voxel = options.voxel or _VOXEL_PIXELS * pixel
+    if voxel < _SMALLEST_VOXEL * pixel:
         raise UserError(
             "`voxel` is smaller than a fifth of a pixel of the photos; use at least {pixel:.3g}",
             pixel=_SMALLEST_VOXEL * pixel,

@@ -9,6 +9,9 @@ import numpy as np
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.util.components import components
 
+#: The fan of a hole has at most this share of the area of the surface: a box lacks one side of 6.
+_HOLE = 0.25
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -47,8 +50,7 @@ def y_up(up: tuple[float, float, float]) -> np.ndarray:
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V, 3) float32: the sum of the normals of the triangles, weighted by area, of length 1."""
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = _across(vertices[faces])
     total = np.stack(
         [
             np.bincount(faces.ravel(), np.repeat(across[:, axis], 3), len(vertices))
@@ -83,47 +85,51 @@ def largest_parts(faces: np.ndarray, count: int, share: float) -> np.ndarray:
 def filled_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with a fan of triangles over each hole; the middle of its border is a new vertex.
 
-    A border is a closed walk along the edges of a single triangle. The longest border of a mesh
-    that is not closed is kept open if it is that of a surface, as of a façade: a hole has at most
-    half of the length of the longest border, unless there is only one.
+    A border is a closed walk along edges that more triangles have in one direction than in the
+    other. The outer border of a surface, as of a façade, is kept open: a border whose fan is larger
+    than a share of the surface, unless it is the only one.
     """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     count = len(vertices)
-    single = np.isin(
-        edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0], invert=True
-    )
+    keys, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
+    back = keys % count * count + keys // count
+    row = np.searchsorted(keys, back).clip(max=len(keys) - 1)
+    more = uses - np.where(keys[row] == back, uses[row], 0)
     following: dict[int, list[int]] = {}
-    for a, b in edges[single].tolist():
-        following.setdefault(a, []).append(b)
+    for key in np.repeat(keys, more.clip(min=0)).tolist():
+        following.setdefault(key // count, []).append(key % count)
+    # As many of these edges enter a vertex as leave it, so each walk ends where it began.
     loops: list[np.ndarray] = []
     while following:
-        start = next(iter(following))
-        loop = [start]
-        while loop[-1] in following:
-            ends = following[loop[-1]]
-            loop.append(ends.pop())
+        walk = [next(iter(following))]
+        place = {walk[0]: 0}
+        while (ends := following.get(walk[-1])) is not None:
+            end = ends.pop()
             if not ends:
-                del following[loop[-2]]
-            if loop[-1] == start:
-                loops.append(np.array(loop[:-1]))
-                break
-    lengths = [_length(vertices[loop]) for loop in loops]
-    limit = 0.5 * max(lengths, default=0.0) if len(loops) > 1 else np.inf
-    middles: list[np.ndarray] = []
-    fans: list[np.ndarray] = []
-    for border, length in zip(loops, lengths, strict=True):
-        if length > limit:
-            continue
-        middle = np.full(len(border), count + len(middles))
-        middles.append(vertices[border].mean(0))
-        fans.append(np.stack([np.roll(border, -1), border, middle], 1))
-    if not fans:
+                del following[walk[-1]]
+            if end not in place:
+                place[end] = len(walk)
+                walk.append(end)
+                continue
+            loops.append(np.array(walk[place[end] :]))
+            while walk[-1] != end:
+                del place[walk.pop()]
+    if not loops:
         return vertices, faces
-    return (
-        np.concatenate([vertices, np.array(middles, vertices.dtype)]),
-        np.concatenate([faces, *fans]).astype(faces.dtype),
-    )
+    middles = np.array([vertices[border].mean(0) for border in loops], vertices.dtype)
+    vertices, largest = np.concatenate([vertices, middles]), _HOLE * _area(vertices[faces])
+    fans = [
+        np.stack([np.roll(border, -1), border, np.full(len(border), count + i)], 1)
+        for i, border in enumerate(loops)
+    ]
+    holes = [fan for fan in fans if len(fans) == 1 or _area(vertices[fan]) <= largest]
+    return compact_mesh(vertices, np.concatenate([faces, *holes]).astype(faces.dtype))[:2]
 
 
-def _length(loop: np.ndarray) -> float:
-    return float(np.linalg.norm(loop - np.roll(loop, 1, 0), axis=1).sum())
+def _area(corners: np.ndarray) -> float:
+    """Of triangles (F, 3, 3)."""
+    return 0.5 * float(np.linalg.norm(_across(corners), axis=1).sum())
+
+
+def _across(corners: np.ndarray) -> np.ndarray:
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

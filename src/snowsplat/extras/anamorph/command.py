@@ -22,7 +22,7 @@ class Anamorph(JsonCommand):
     Examples:
       snowsplat anamorph cat.jpg dog.jpg -o pets
       snowsplat anamorph cat.jpg dog.jpg bird.jpg -o pets --shape solid
-      snowsplat mesh pets -o pets.ply --fill-holes
+      snowsplat mesh pets -o pets.ply --gaussians-only
 
     Notes:
       The first picture is seen from the front, the second from the right, the
@@ -66,6 +66,6 @@ class Anamorph(JsonCommand):
             "to see it: open {page} in a browser; to share it: send this file", page=result.page
         )
         if self.options.shape == "solid":
-            mesh = "mesh", self.output, "-o", self.output / "mesh.ply", "--fill-holes"
+            mesh = "mesh", self.output, "-o", self.output / "mesh.ply", "--gaussians-only"
             print(next_step(message("to print it"), *mesh))
         return result

@@ -137,6 +137,7 @@ class MeshOptions(Settings):
         metavar="N",
     )
     fill_holes: bool = switch("Close holes with flat triangles, as 3D printing needs it.")
+    gaussians_only: bool = switch("Do not compare the photos: for photos that are renders.")
 
 
 def _problem(url: str) -> str | None:
