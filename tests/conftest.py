@@ -1,4 +1,4 @@
-"""Shared by all tests: signals, threads of parallel processes, and automatic marks.
+"""Shared by all tests: a dataset, signals, threads of parallel processes, and automatic marks.
 
 `make quick` leaves out the marks sfm, browser, build, emulated, kill, slow and gpu; pyproject.toml
 describes them.
@@ -39,6 +39,15 @@ _OF_FOLDERS = {
 }
 _QUICK = {"cli/test_main.py"}
 _OF_FIXTURES = {"recorder": "build", "start": "slow"}
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory) -> Path:
+    """A folder of 9 views, 48×36; read-only for the tests."""
+    from snowsplat.synthetic.toy_dataset import write_toy_dataset
+
+    root = tmp_path_factory.mktemp("shared")
+    return write_toy_dataset(root / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

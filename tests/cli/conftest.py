@@ -1,16 +1,14 @@
-"""A small dataset; the command line, called in this process or as a separate one."""
+"""The command line, called in this process or as a separate one."""
 
 import functools
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 
 from snowsplat import extras
 from snowsplat.cli.main import main
-from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 from ..fork_server import Process, popen
 
@@ -22,13 +20,6 @@ class Result:
     code: int
     out: str
     err: str
-
-
-@pytest.fixture(scope="session")
-def dataset(tmp_path_factory) -> Path:
-    """9 views, 48×36; read-only for the tests."""
-    root = tmp_path_factory.mktemp("cli")
-    return write_toy_dataset(root / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
 
 
 @pytest.fixture

@@ -5,21 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.synthetic.toy_dataset import write_toy_dataset
-
 from ..fork_server import popen
 from ..sfm.colmap import scenes
 from .harness import Runner
 
 if sys.platform != "linux":
     collect_ignore = ["test_kills.py", "test_pressure.py"]  # fork, process groups, mounts
-
-
-@pytest.fixture(scope="session")
-def dataset(tmp_path_factory) -> Path:
-    """9 views, 48×36; read-only for the tests."""
-    root = tmp_path_factory.mktemp("kill")
-    return write_toy_dataset(root / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
 
 
 @pytest.fixture(scope="session")

@@ -35,14 +35,3 @@ def test_quaternion_product_and_matrix():
     found = reference._rotation_matrices(torch.stack([q, -q, 5 * q]))
     for matrix in found:
         assert torch.allclose(matrix, R, atol=1e-14)
-
-
-def test_the_zero_quaternion_is_the_identity():
-    zero = torch.zeros(1, 4, dtype=torch.float64)
-    assert torch.equal(reference._rotation_matrices(zero)[0], torch.eye(3, dtype=torch.float64))
-
-
-def test_the_gradient_of_the_quaternion_is_perpendicular_to_it():
-    q = normal(5, 4).requires_grad_()
-    (reference._rotation_matrices(q) * normal(5, 3, 3, seed=4)).sum().backward()
-    assert (q.grad * q).sum(dim=1).abs().max() < 1e-14

@@ -16,7 +16,6 @@ import pytest
 
 from snowsplat.cli.main import main
 from snowsplat.pipeline.run import processes
-from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
 from ..fork_server import popen, run
@@ -28,12 +27,6 @@ SCENE = "point_cloud/iteration_120/point_cloud.ply"
 
 
 TRAIN = ("-m", "snowsplat", "train")
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("processes")
-    return write_toy_dataset(root / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
 
 
 @pytest.fixture(scope="module")

@@ -130,12 +130,10 @@ def _value(flag: Flag, value: Any) -> Any:
 
 
 def _item(value: Any, kinds: list[Any]) -> Any:
-    if isinstance(value, bool) and any("on" in get_args(k) for k in kinds if _is_literal(k)):
+    if isinstance(value, bool) and any(
+        "on" in get_args(k) for k in kinds if get_origin(k) is Literal
+    ):
         return "on" if value else "off"
     if Path in kinds:
         return Path(str(value))
     return str(value) if str in kinds else value
-
-
-def _is_literal(kind: Any) -> bool:
-    return get_origin(kind) is Literal

@@ -16,6 +16,7 @@ import re
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from functools import reduce
+from itertools import takewhile
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
@@ -100,7 +101,11 @@ def explained(command: type[Command], arguments: Sequence[str], printed: str) ->
         kinds = [each for each in kinds_of(hint) if each is not NoneType]
         if kinds == [bool]:
             continue
-        texts = [value] if given else _values(arguments[number + 1 :])
+        texts = (
+            [value]
+            if given
+            else [*takewhile(lambda word: not _FLAG.match(word), arguments[number + 1 :])]
+        )
         if get_origin(kinds[0]) is tuple:
             kinds = [get_args(kinds[0])[0]]
         elif not texts:
@@ -136,16 +141,6 @@ def spellings(command: type[Command]) -> dict[str, tuple[Any, Message]]:
         declared = (flag.declared,) if flag.type == flag.hint or flag.declared.parse else ()
         known |= dict.fromkeys(flag.spellings, (flag.type, allowed(flag.type, *declared)))
     return known
-
-
-def _values(arguments: Sequence[str]) -> list[str]:
-    """The arguments before the next flag."""
-    values = []
-    for argument in arguments:
-        if _FLAG.match(argument):
-            break
-        values.append(argument)
-    return values
 
 
 def _is_of(text: str, kind: Any) -> bool:

@@ -101,7 +101,10 @@ def parse(arguments: Sequence[str]) -> Command:
     Raises: UserError: an unknown subcommand, or invalid or refused flags.
     """
     name, *rest = arguments
-    import_own_files(_imports(rest))
+    # The files of `--import` are needed before the other flags are known.
+    own = [file for flag, file in pairwise(rest) if flag == "--import"]
+    own += [word.removeprefix("--import=") for word in rest if word.startswith("--import=")]
+    import_own_files(own)
     if name not in SUBCOMMANDS and not name.startswith("-"):
         raise UserError(_unknown_subcommand(name))
     rest, notes = translated(name, rest)
@@ -132,12 +135,6 @@ def parse(arguments: Sequence[str]) -> Command:
 
         given = with_file(command, given)
     return command.of(given)
-
-
-def _imports(words: Sequence[str]) -> list[str]:
-    """The files of `--import`, which are needed before the other flags are known."""
-    after = [file for flag, file in pairwise(words) if flag == "--import"]
-    return after + [w.removeprefix("--import=") for w in words if w.startswith("--import=")]
 
 
 def _with_flags(message: str, arguments: Sequence[str]) -> str:

@@ -12,19 +12,15 @@ def check_tensor(
     op: str, name: str, tensor: Tensor, shape: tuple[int | None, ...], like: Tensor
 ) -> None:
     """Raises ValueError unless `tensor` has `shape` (None: any), and dtype and device of `like`."""
-    if tensor.shape != shape and not _fits(tensor.shape, shape):
+    if len(tensor.shape) != len(shape) or any(
+        want not in (None, got) for want, got in zip(shape, tensor.shape, strict=True)
+    ):
         wanted = ", ".join("any" if s is None else str(s) for s in shape)
         raise ValueError(f"{op}: {name} must be ({wanted}), got {tuple(tensor.shape)}")
     if tensor.dtype != like.dtype:
         raise ValueError(f"{op}: {name} must be {like.dtype}, got {tensor.dtype}")
     if tensor.device != like.device:
         raise ValueError(f"{op}: {name} must be on {like.device}, got {tensor.device}")
-
-
-def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(wanted) and all(
-        want is None or want == got for want, got in zip(wanted, shape, strict=True)
-    )
 
 
 def check_ids(op: str, ids: Tensor, like: Tensor) -> None:

@@ -161,7 +161,8 @@ def convert(
     def write_placed(path: Path, gaussians: Gaussians) -> None:
         # The scene is moved last: cameras and photos show it in its place.
         with observer.waiting("writing"):
-            written[:] = [_moved(edits, gaussians)]
+            change = transform_of(edits)
+            written[:] = [edit.transform_world(gaussians, change) if change else gaussians]
             write(path, *written)
 
     if size is not None:
@@ -240,12 +241,6 @@ def _reduced(edits: Edits, scene: Gaussians) -> Gaussians:
     if edits.sh_degree is not None:
         scene = edit.with_sh_degree(scene, edits.sh_degree)
     return scene
-
-
-def _moved(edits: Edits, scene: Gaussians) -> Gaussians:
-    """The rotated, scaled and translated scene, in float64; ``scene`` is unchanged."""
-    transform = transform_of(edits)
-    return edit.transform_world(scene, transform) if transform else scene
 
 
 def transform_of(edits: Edits) -> Similarity | None:

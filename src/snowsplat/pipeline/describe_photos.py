@@ -35,10 +35,12 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
     Raises: UserError: a video is not readable.
     """
     path = sources.inputs[0]
-    headers, left_out = _headers(sources.photos), list(sources.left_out)
-    unusable = {name: header for name, header in headers.items() if isinstance(header, Message)}
-    usable = [header for header in headers.values() if isinstance(header, Header)]
-    left_out += [LeftOut(name, "photos", why) for name, why in unusable.items()]
+    usable, left_out = [], list(sources.left_out)
+    for source in sources.photos:
+        try:
+            usable.append(read_header(source.path))
+        except Unusable as error:
+            left_out.append(LeftOut(shown(source.path), "photos", error.message))
     photos = survey(sources)
     speed = measure_speed(thread_count(None))
     time = duration(predicted_seconds(photos, PRESETS["normal"].photos, "normal", speed))
@@ -77,17 +79,6 @@ def describe_zip(path: Path) -> dict[str, Any]:
             "snowsplat make {path}, which unpacks it into a folder beside it", path=path
         ),
     }
-
-
-def _headers(photos: Sequence[Source]) -> dict[str, Header | Message]:
-    """By file: its header, or the reason why the photo is unusable."""
-    found: dict[str, Header | Message] = {}
-    for source in photos:
-        try:
-            found[shown(source.path)] = read_header(source.path)
-        except Unusable as error:
-            found[shown(source.path)] = error.message
-    return found
 
 
 def _of_photos(headers: Sequence[Header], sources: Sequence[Source]) -> dict[str, Any]:

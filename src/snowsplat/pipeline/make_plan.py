@@ -156,7 +156,11 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
         dataset = read_dataset(settings)
         views = [*dataset.train, *dataset.test]
         without = _without_pose(sources.photos, views)
-        reason = _why_not(dataset, len(without), len(sources.photos))
+        reason = next((each.text for each in judge(dataset) if each.impossible), None)
+        if not reason and len(without) > (1 - _LEAST_SHARE) * len(sources.photos):
+            reason = message(
+                "{n} of {photos} photos have no pose", n=len(without), photos=len(sources.photos)
+            )
     except UserError as error:
         reason = error.message
     if reason:
@@ -188,16 +192,6 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
             path=shown(without[0].path),
         )
     return dataset
-
-
-def _why_not(dataset: Dataset, without: int, photos: int) -> Message | None:
-    """The reason why the poses are not used; None if they are."""
-    impossible = [finding.text for finding in judge(dataset) if finding.impossible]
-    if impossible:
-        return impossible[0]
-    if without > (1 - _LEAST_SHARE) * photos:
-        return message("{n} of {photos} photos have no pose", n=without, photos=photos)
-    return None
 
 
 def _without_pose(photos: Sequence[Source], views: Sequence[View]) -> list[Source]:

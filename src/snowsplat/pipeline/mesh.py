@@ -193,8 +193,7 @@ def _depth_maps(
     far = options.far
     if far is None:
         sample = cameras[:: math.ceil(len(cameras) / _SAMPLE_VIEWS)]
-        small = [each.scaled(max(1, each.width // 4), max(1, each.height // 4)) for each in sample]
-        far = _REACH * _usual_depth([renderer.render(camera) for camera in small])
+        far = _REACH * _usual_depth([renderer.render(camera.downscaled(4)) for camera in sample])
     partial = [
         view.mask is not None or view.image.path.suffix.lower() not in _OPAQUE for view in views
     ]

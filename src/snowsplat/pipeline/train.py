@@ -220,9 +220,9 @@ class _Job:
         # The first run has refused impossible cameras, or not.
         self.doubts, _ = check_cameras(dataset, settings.path, trusted=True)
         self._compare_photos(dataset, settings.path, meta)
-        memory = plan_memory(
-            dataset, config, self.device, budget=options.memory, present=_gaussians_in(start)
-        )
+        means = start.tensors.get("gaussians.means")  # checked when the state is loaded
+        present = 0 if means is None else means.numel() // 3
+        memory = plan_memory(dataset, config, self.device, budget=options.memory, present=present)
         self.shards.of_first(Setup(settings, memory.config, schedule, start.path))
         trainer = self._trainer(dataset, memory.config, schedule, start.tensors)
         start.arrays.clear()  # the trainer has a copy, which is the one in the memory plan
@@ -421,11 +421,6 @@ def _other_settings(start: Checkpoint) -> UserError:
         "(`iterations`, `test_iterations`, `checkpoint_every` may change)",
         path=start.path,
     )
-
-
-def _gaussians_in(start: Checkpoint) -> int:
-    means = start.tensors.get("gaussians.means")  # checked when the state is loaded
-    return 0 if means is None else means.numel() // 3
 
 
 def _described(dataset: Dataset) -> Message:

@@ -57,7 +57,11 @@ class KnownDistance:
         """
         a, b = (_point(text) for text in self.between)
         if a is None or b is None:
-            photos = _positions(scene)
+            # In the world of the file of the scene, which may be edited.
+            names, cameras = cameras_of(scene.original.training)
+            change = change_of(scene.edit) if scene.edit else Similarity.identity()
+            places = [change.apply(camera.position).numpy() for camera in cameras]
+            photos = dict(zip(names, places, strict=True))
             a = _photo(self.between[0], photos) if a is None else a
             b = _photo(self.between[1], photos) if b is None else b
         distance = float(np.linalg.norm(a - b))
@@ -76,14 +80,6 @@ def _point(text: str) -> np.ndarray | None:
     except ValueError:
         return None
     return point if point.shape == (3,) and np.isfinite(point).all() else None
-
-
-def _positions(scene: Project) -> dict[str, np.ndarray]:
-    """The positions (3,) of the photos of the training of ``scene``, in the world of its file."""
-    names, cameras = cameras_of(scene.original.training)
-    change = change_of(scene.edit) if scene.edit else Similarity.identity()
-    positions = (change.apply(camera.position).numpy() for camera in cameras)
-    return dict(zip(names, positions, strict=True))
 
 
 def _photo(name: str, photos: dict[str, np.ndarray]) -> np.ndarray:

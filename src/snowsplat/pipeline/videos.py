@@ -205,7 +205,11 @@ def cameras_along(
                 known=[*CAMERA_PATHS],
             )
         _, keys = read_cameras(Path(path))
-        keys = _in_frame_of(gaussians, keys)
+        # Cameras in the world are nearer to the origin of the scene than to 0.
+        middle = torch.stack([camera.position for camera in keys]).mean(0)
+        origin = torch.tensor(gaussians.origin, dtype=middle.dtype)
+        if (middle - origin).norm() < middle.norm():
+            keys = [camera.seen_from(gaussians.origin) for camera in keys]
         distance = trajectory.viewing_distance(keys, gaussians.means)
         speeds = read_speeds(Path(path))
         cameras = trajectory.key_path(keys, frames, distance, ease=ease, speeds=speeds)
@@ -229,12 +233,3 @@ def cameras_along(
         )
     width, height = size.for_camera(cameras[0])
     return [trajectory.resized(camera, width, height) for camera in cameras]
-
-
-def _in_frame_of(gaussians: Gaussians, cameras: list[Camera]) -> list[Camera]:
-    """Cameras relative to the origin of the scene. In the world they are nearer to it than to 0."""
-    middle = torch.stack([camera.position for camera in cameras]).mean(0)
-    origin = torch.tensor(gaussians.origin, dtype=middle.dtype)
-    if (middle - origin).norm() >= middle.norm():
-        return cameras
-    return [camera.seen_from(gaussians.origin) for camera in cameras]

@@ -90,6 +90,11 @@ class Camera:
         lens = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
         return Camera(width, height, *lens, self.cam_from_world, self.near)
 
+    def reduced(self, longest: int) -> Camera:
+        """The same view in an image whose longer side has at most ``longest`` pixels."""
+        scale = min(1.0, longest / max(self.width, self.height))
+        return self.scaled(max(1, round(scale * self.width)), max(1, round(scale * self.height)))
+
     def to(self, device: torch.device) -> Camera:
         """This camera with its pose on ``device``, as rendering on that device needs it."""
         return dataclasses.replace(self, cam_from_world=self.cam_from_world.to(device))
@@ -121,11 +126,16 @@ class Camera:
         focal, centre = points.new_tensor([[self.fx, self.fy], [self.cx, self.cy]])
         return x_cam[:, :2] / depth[:, None] * focal + centre, depth
 
-    def depths_in_view(self, points: Tensor) -> Tensor:
-        """The depths (V,) of those of the world points (P, 3) that are in the image; in order."""
+    def sees(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The depths (P,) of world points (P, 3), and whether they are in the image."""
         pixel, depth = self.project(points)
         size = pixel.new_tensor([self.width, self.height])
-        return depth[(depth > 0.0) & ((pixel >= 0.0) & (pixel < size)).all(1)]
+        return depth, (depth > 0.0) & ((pixel >= 0.0) & (pixel < size)).all(1)
+
+    def depths_in_view(self, points: Tensor) -> Tensor:
+        """The depths (V,) of those of the world points (P, 3) that are in the image; in order."""
+        depth, inside = self.sees(points)
+        return depth[inside]
 
 
 def near_of_overview(distance: float) -> float:

@@ -60,7 +60,7 @@ def ground_of(gaussians: Gaussians, cameras: Sequence[Camera], up: np.ndarray) -
     """
     if not cameras:
         raise UserError("`walk` needs the cameras of the photos; use the output folder of train")
-    chosen = [_small(camera) for camera in cameras[:: math.ceil(len(cameras) / _VIEWS)]]
+    chosen = [camera.reduced(_SIDE) for camera in cameras[:: math.ceil(len(cameras) / _VIEWS)]]
     renderer = SurfaceRenderer(gaussians)
     maps = [renderer.render(camera) for camera in chosen]
     depths = [each.depth[each.depth.isfinite() & (each.depth > 0)] for each in maps]
@@ -93,11 +93,6 @@ def _plane(vertices: np.ndarray, height: float, up: np.ndarray) -> tuple[np.ndar
     ahead = np.cross(up, right)
     corners = [middle + a * right + b * ahead for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
     return np.array(corners, np.float32), np.array([[0, 1, 2], [0, 2, 3]])
-
-
-def _small(camera: Camera) -> Camera:
-    share = min(1.0, _SIDE / max(camera.width, camera.height))
-    return camera.scaled(*(max(1, round(share * n)) for n in (camera.width, camera.height)))
 
 
 def _height(camera: Camera, level: np.ndarray, up: np.ndarray) -> float | None:

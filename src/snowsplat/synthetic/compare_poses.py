@@ -38,12 +38,7 @@ def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> Po
     extent = float(torch.cdist(true_centres, true_centres).max())
     distances = (invert_rigid(aligned)[..., 3] - true_centres).norm(dim=1)
     missing = sorted(true.keys() - found.keys())
-    rotations = _angles(aligned[..., :3], true_poses[..., :3])
-    return PoseErrors(names, missing, rotations, distances / extent, extent)
-
-
-def _angles(a: Tensor, b: Tensor) -> Tensor:
-    """Angles in degrees (N,) between rotations (N, 3, 3), accurate for small angles, too."""
     # |A − B| (Frobenius) is 2√2 sin(θ/2). The arccosine of the trace would lose half the digits.
-    sine = (a - b).flatten(1).norm(dim=1) / 8**0.5
-    return 2 * torch.rad2deg(torch.asin(sine.clamp(max=1.0)))
+    sine = (aligned[..., :3] - true_poses[..., :3]).flatten(1).norm(dim=1) / 8**0.5
+    rotations = 2 * torch.rad2deg(torch.asin(sine.clamp(max=1.0)))
+    return PoseErrors(names, missing, rotations, distances / extent, extent)

@@ -56,7 +56,9 @@ class Scene:
         for item in objects:
             firsts.append(len(textures))
             for face, size in enumerate(item.shape.sizes):
-                paint = _linear(item.paint[face % len(item.paint)])
+                srgb = item.paint[face % len(item.paint)]
+                # Values above 1 are brighter than white.
+                paint = np.where(srgb > 1, srgb, to_linear(srgb.clip(0, 1))).astype(np.float32)
                 if not item.emissive:
                     paint = paint * irradiance(item.shape, face, paint.shape[:2], lamp, blockers)
                 textures.append(paint)
@@ -203,11 +205,6 @@ class Scene:
         (a, b), (c, d) = corners
         top, bottom = a + wx * (b - a), c + wx * (d - c)
         return np.ascontiguousarray((top + wy * (bottom - top)).T)
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values; values above 1 (brighter than white) are unchanged."""
-    return np.where(srgb > 1, srgb, to_linear(srgb.clip(0, 1))).astype(np.float32)
 
 
 def _halved(texture: np.ndarray) -> np.ndarray:

@@ -270,7 +270,9 @@ class Ring:
         # Start at the bounding ball, or at the origin if that is inside.
         distance = np.maximum(along[live] - np.float32(self.radius), 0)
         for _ in range(self._STEPS):
-            away = self._distance(start + distance * step)
+            own = start + distance * step
+            ring = np.hypot(own[0], own[1]) - self.ring
+            away = np.hypot(ring, own[2]) - np.float32(self.tube)
             found = away < self._NEAR
             result[live[found]] = distance[found]
             distance = distance + away
@@ -280,9 +282,6 @@ class Ring:
             if not len(live):
                 break
         return result
-
-    def _distance(self, own: np.ndarray) -> np.ndarray:
-        return np.hypot(np.hypot(own[0], own[1]) - self.ring, own[2]) - np.float32(self.tube)
 
     def surface(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         x, y, z = self._own_from_world @ (positions - self.centre)

@@ -150,27 +150,15 @@ def write_toy_dataset(
     if format == "blender":
         _write_blender(folder, scene, cameras)
     else:
-        xyz, rgb, tracks = _sample_points(scene, cameras, n_points, np.random.default_rng(seed))
-        _write_colmap(folder, scene, cameras, xyz, rgb, tracks, text=format == "colmap-txt")
+        points = _sample_points(scene, cameras, n_points, np.random.default_rng(seed))
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        posed = []
+        for i, camera in enumerate(cameras):
+            name = f"view_{i:02d}.png"
+            Image.fromarray(_render(scene, camera)[..., :3]).save(folder / "images" / name)
+            posed.append((name, pinhole_of(camera), camera.cam_from_world))
+        write_posed(folder / "sparse" / "0", posed, *points, text=format == "colmap-txt")
     return folder
-
-
-def _write_colmap(
-    folder: Path,
-    scene: _Scene,
-    cameras: list[Camera],
-    xyz: np.ndarray,
-    rgb: np.ndarray,
-    tracks: list[list[tuple[int, int]]],
-    text: bool,
-) -> None:
-    folder.joinpath("images").mkdir(parents=True, exist_ok=True)
-    posed = []
-    for i, camera in enumerate(cameras):
-        name = f"view_{i:02d}.png"
-        Image.fromarray(_render(scene, camera)[..., :3]).save(folder / "images" / name)
-        posed.append((name, pinhole_of(camera), camera.cam_from_world))
-    write_posed(folder / "sparse" / "0", posed, xyz, rgb, tracks, text=text)
 
 
 def _write_blender(folder: Path, scene: _Scene, cameras: list[Camera]) -> None:

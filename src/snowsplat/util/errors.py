@@ -7,7 +7,16 @@ from typing import Any
 from snowsplat.util.messages import Message, as_message, message
 
 
-class UserError(Exception):
+class _WithMessage(Exception):
+    def __init__(self, key: str | Message, /, **values: Any) -> None:
+        self.message = message(key, **values) if isinstance(key, str) else key
+        super().__init__(self.message)
+
+    def __str__(self) -> str:
+        return str(self.message)
+
+
+class UserError(_WithMessage):
     """An error with a one-line message: what is wrong, and what to do.
 
         raise UserError("{path}: is a file; use a folder", path=path)
@@ -18,13 +27,6 @@ class UserError(Exception):
     Attributes:
         message: the key and its values, see `Message`.
     """
-
-    def __init__(self, key: str | Message, /, **values: Any) -> None:
-        self.message = message(key, **values) if isinstance(key, str) else key
-        super().__init__(self.message)
-
-    def __str__(self) -> str:
-        return str(self.message)
 
 
 #: What systems say of files, as `cause_of` finds it.
@@ -69,16 +71,9 @@ class SettingError(UserError):
         self.args = (setting, self.problem)  # by which pickle makes the error again
 
 
-class Problem(ValueError):
+class Problem(_WithMessage, ValueError):
     """What is wrong with a value, a file or a part of one; who catches it says with which.
 
     Attributes:
         message: see `UserError`.
     """
-
-    def __init__(self, key: str | Message, /, **values: Any) -> None:
-        self.message = message(key, **values) if isinstance(key, str) else key
-        super().__init__(self.message)
-
-    def __str__(self) -> str:
-        return str(self.message)

@@ -33,12 +33,6 @@ _HERE = -100  # AT_FDCWD: paths are relative to the working folder
 _TEMPORARY = re.compile(r"\.(.+?)(\.[a-z0-9_]{8})?\.tmp")
 
 
-def _default_mode() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return 0o666 & ~mask
-
-
 @contextlib.contextmanager
 def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
     """Context with a temporary file that is renamed to ``path`` when the block ends.
@@ -64,7 +58,8 @@ def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
             if path in COMPLETE:
                 COMPLETE[path](temporary.stat())
             if not private:  # as mkstemp and _lock create them
-                os.chmod(temporary, _default_mode())
+                os.umask(mask := os.umask(0))
+                os.chmod(temporary, 0o666 & ~mask)
             _check(path)
             os.replace(temporary, path)
         except BaseException:
@@ -324,17 +319,8 @@ def write_json(path: Path | str, value: Any) -> None:
 
     Raises OSError like `atomic_path`.
     """
-    write_text(path, json.dumps(_finite(value), indent=2, allow_nan=False) + "\n")
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if value - value == 0.0 else None
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return value
+    finite = json.loads(json.dumps(value), parse_constant=lambda _: None)
+    write_text(path, json.dumps(finite, indent=2, allow_nan=False) + "\n")
 
 
 def shown(path: Path | str) -> str:

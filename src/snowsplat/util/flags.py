@@ -105,7 +105,8 @@ def _flags(name: str, hint: Any, declared: Setting, value: Any) -> Iterator[Flag
     if declared.metavar is not None:
         default = declared.default
         if default is None:
-            default = "" if value in (None, False, "", MISSING) else _words_of(value)
+            items = value if isinstance(value, tuple) else [value]
+            default = "" if value in (None, False, "", MISSING) else " ".join(map(_text, items))
         yield Flag(name, (name,), hint, declared, "" if declared.metavar == "" else default)
     seen = set[str]()
     for kind in declared.kinds:
@@ -194,10 +195,6 @@ def with_flags(message: str, kind: type | None = None) -> str:
         return "--" + names.get(match[1], match[1]).replace("_", "-")
 
     return _SETTING.sub(flag, message)
-
-
-def _words_of(value: Any) -> str:
-    return " ".join(map(_text, value if isinstance(value, tuple) else [value]))
 
 
 def _text(value: Any) -> str:

@@ -154,10 +154,8 @@ def from_json(kind: type[_Kind], values: Any) -> _Kind:
         raise Problem(as_message(error)) from None
 
 
-@functools.cache
-def _hints(kind: Any) -> dict[str, Any]:
-    """The types of the fields. To find them takes longer than the rest of `from_json`."""
-    return get_type_hints(kind)
+# To find the types of the fields takes longer than the rest of `from_json`.
+_hints = functools.cache(get_type_hints)
 
 
 def _as(hint: Any, value: Any) -> Any:

@@ -64,7 +64,9 @@ class KnownHosts:
         try:
             address = ipaddress.ip_address(name)
         except ValueError:
-            return not is_loopback(self._listening) and name in _names_of_this_machine()
+            own = socket.gethostname().lower()
+            short = own.partition(".")[0]
+            return not is_loopback(self._listening) and name in (own, short, f"{short}.local")
         return address.is_loopback or not is_loopback(self._listening)
 
     def include_page(self, origin: str, host: str) -> bool:
@@ -123,11 +125,6 @@ def _valid(allowed: str) -> str:
             allowed=allowed,
         )
     return name
-
-
-def _names_of_this_machine() -> set[str]:
-    name = socket.gethostname().lower()
-    return {name, name.partition(".")[0], f"{name.partition('.')[0]}.local"}
 
 
 def listen(host: str, port: int | None) -> socket.socket:

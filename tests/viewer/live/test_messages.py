@@ -9,7 +9,7 @@ import torch
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, quat_from_rotation
 from snowsplat.viewer.live.browser import Key, Share, Shown, Thumbnails, Training, parse, to_json
-from snowsplat.viewer.live.pictures import Display, PhotoRectangle, View, fit
+from snowsplat.viewer.live.pictures import Display, PhotoRectangle, View
 
 from .. import clients
 
@@ -75,12 +75,6 @@ def test_the_camera_of_a_browser():
     assert middle[0].tolist() == pytest.approx([160, 120])
     assert float(depth) == pytest.approx(math.sqrt(14))
     assert 2 * math.atan(120 / camera.fy) == pytest.approx(1.0)
-
-
-def test_fit_keeps_the_aspect_ratio_and_never_enlarges():
-    assert fit(1920, 1080, 960) == (960, 540)
-    assert fit(400, 300, 960) == (400, 300)
-    assert fit(10_000, 3, 100) == (100, 1)
 
 
 @pytest.mark.parametrize("window", [(640, 200), (200, 640), (300, 300)])

@@ -127,7 +127,8 @@ def _same_end(
                     alike = [
                         file
                         for other, file in ends.get(end, [])[:_MOST_ALIKE]
-                        if len(other) == length or _says_nothing(key, other, length)
+                        if len(other) == length
+                        or PHOTO_FOLDERS & {key[-length - 1], other[-length - 1]}
                     ]
                 else:
                     among = ends if length == len(key) else whole
@@ -140,11 +141,6 @@ def _same_end(
                     best = length
                     break
     return found
-
-
-def _says_nothing(one: tuple[str, ...], other: tuple[str, ...], length: int) -> bool:
-    """Whether a folder where the two paths differ is just called "images" or the like."""
-    return bool(PHOTO_FOLDERS & {one[-length - 1], other[-length - 1]})
 
 
 def _keys(path: str, with_suffix: bool) -> Iterator[tuple[str, ...]]:

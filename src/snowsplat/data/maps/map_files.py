@@ -202,20 +202,17 @@ def to_z(
     if kind == "disparity":
         depth = 1.0 / depth
     elif kind == "distance":
-        depth = depth / _ray_lengths(depth.shape[1], depth.shape[0], camera)
+        # Divided by the distances of the points with z = 1 on the rays.
+        height, width = depth.shape
+        scaled = camera.scaled(width, height)
+        u = (torch.arange(width, dtype=torch.float64) + 0.5 - scaled.cx) / scaled.fx
+        v = (torch.arange(height, dtype=torch.float64) + 0.5 - scaled.cy) / scaled.fy
+        depth = depth / (1.0 + u.square() + v.square()[:, None]).sqrt()
     elif photo_z is not None:
         turned = torch.from_numpy(photo_z)
         known &= turned > 0
         depth = depth / turned
     return torch.where(known, depth, torch.nan).float()
-
-
-def _ray_lengths(width: int, height: int, camera: Camera) -> Tensor:
-    """(H, W): the distance of the points with z = 1 on the rays of a ``width`` × ``height`` map."""
-    scaled = camera.scaled(width, height)
-    u = (torch.arange(width, dtype=torch.float64) + 0.5 - scaled.cx) / scaled.fx
-    v = (torch.arange(height, dtype=torch.float64) + 0.5 - scaled.cy) / scaled.fy
-    return (1.0 + u.square() + v.square()[:, None]).sqrt()
 
 
 def read_normal_file(path: Path) -> np.ndarray:

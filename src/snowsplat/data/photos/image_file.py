@@ -90,7 +90,9 @@ def open_image(
             image.seek(page)
         _check_size(image, os.path.getsize(path))
         if image.format in ("JPEG", "MPO") and not (header_only and complete):
-            _check_scans(image, path)
+            scans = sum(marker == _SCAN for marker, *_ in _segments(path.read_bytes()))
+            if scans * image.width * image.height > _MOST_SCANNED_PIXELS:
+                raise Problem("too many scans ({scans}) for its size", scans=scans)
         if header_only and not complete:  # a copy that was interrupted, or bytes after the image
             with Image.open(path, formats=list(formats)) as whole:
                 whole.draft(None, (1, 1))
@@ -186,12 +188,6 @@ def _check_size(image: Image.Image, size: int) -> None:
         places, lengths = (tags.get(a) or tags.get(b) or () for a, b in ((273, 324), (279, 325)))
         if any(a + b > size for a, b in zip(places, lengths, strict=False)):
             raise Problem("its data ends early")
-
-
-def _check_scans(image: Image.Image, path: Path) -> None:
-    scans = sum(marker == _SCAN for marker, *_ in _segments(path.read_bytes()))
-    if scans * image.width * image.height > _MOST_SCANNED_PIXELS:
-        raise Problem("too many scans ({scans}) for its size", scans=scans)
 
 
 def _segments(data: bytes) -> Iterator[tuple[bytes, int, int]]:

@@ -15,19 +15,16 @@ from snowsplat.evaluation.metrics import Evaluation, compare
 from snowsplat.extras.anamorph.arrangement import AROUND, FIELD, arranged, camera_around, camera_of
 from snowsplat.extras.anamorph.options import AnamorphOptions
 from snowsplat.extras.image.fit_image import load_photo
+from snowsplat.extras.pictures import write_pictures
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.image_files import write_png
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.run.training_files import write_beginning, write_scene
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
-from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import invert_rigid
-from snowsplat.scene.render import render, to_8bit
+from snowsplat.scene.render import render
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import write_json
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.publication import write_html
 
@@ -89,7 +86,7 @@ def make_anamorph(
     cameras = [camera_of(side, round(FIELD * options.size)) for side in range(len(squares))]
     photos = [_photo(square, camera.width) for square, camera in zip(squares, cameras, strict=True)]
     settings = DatasetSettings(str((out.path / PICTURES).absolute()))
-    _write_dataset(out.path / PICTURES, photos, cameras)
+    write_pictures(out.path / PICTURES, NAMES, photos, cameras)
     dataset = read_dataset(settings)
     config = recipe(
         "classic",
@@ -113,7 +110,7 @@ def make_anamorph(
         cameras += [camera_around(direction, cameras[0].width) for direction in AROUND]
     with torch.no_grad():
         seen = [render(trainer.gaussians, camera).image for camera in cameras]
-    _write_dataset(out.path / PICTURES, [*photos, *seen[len(photos) :]], cameras)
+    write_pictures(out.path / PICTURES, NAMES, [*photos, *seen[len(photos) :]], cameras)
     metrics = [
         compare(image, photo, name=name)
         for image, photo, name in zip(seen, photos, NAMES, strict=False)
@@ -138,19 +135,3 @@ def _photo(picture: Tensor, width: int) -> Tensor:
     before = (width - len(picture)) // 2
     after = width - len(picture) - before
     return pad(picture, (0, 0, before, after, before, after))
-
-
-def _write_dataset(folder: Path, photos: list[Tensor], cameras: list[Camera]) -> None:
-    """Write photos (H, H, 3) with their poses in place of earlier ones."""
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    for earlier in (folder / "images").iterdir():
-        earlier.unlink()
-    frames = []
-    for photo, camera, name in zip(photos, cameras, NAMES, strict=False):
-        write_png(folder / "images" / f"{name}.png", to_8bit(photo))
-        pose = invert_rigid(camera.cam_from_world)
-        pose[:, 1:3] *= -1  # the axes of the format
-        frame = {"file_path": f"images/{name}.png", "w": camera.width, "h": camera.height}
-        frame |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-        frames.append(frame | {"transform_matrix": [*pose.tolist(), [0, 0, 0, 1]]})
-    write_json(folder / "transforms.json", {"frames": frames})

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from snowsplat.extras.globe import glass
 from snowsplat.extras.globe.layout import Arrangement
@@ -136,11 +135,13 @@ def appearance(gaussians: Gaussians, snow: Snow) -> Gaussians:
     colors = gaussians.base_colors
     bright = colors / colors.amax(1, keepdim=True).clamp(1.0 / BRIGHTER, 1.0)
     change = bright + WHITE * (1.0 - bright) - colors
+    half = 0.5 * snow.angle
+    spin = np.concatenate([np.cos(half)[None], np.sin(half) * spin_axes(len(half))])
     return replace(
         gaussians,
         means=torch.from_numpy(snow.position.T.copy()),
         log_scales=scales + morph[:, None] * (scales.clamp(low, high) - scales),
-        quats=quat_product(_spin(snow), gaussians.rotations),
+        quats=quat_product(torch.from_numpy(spin.T.copy()), gaussians.rotations),
         opacity_logits=torch.where(
             morph > 0,
             (opacities + morph * (opacities.clamp_min(OPAQUE) - opacities)).logit(1e-6),
@@ -157,9 +158,3 @@ def spin_axes(count: int) -> np.ndarray:
     azimuth = 2.0 * math.pi * random_numbers(count, 10)
     across = np.sqrt(1.0 - z * z)
     return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z]).astype(np.float32)
-
-
-def _spin(snow: Snow) -> Tensor:
-    half = 0.5 * snow.angle
-    turn = np.concatenate([np.cos(half)[None], np.sin(half) * spin_axes(len(half))])
-    return torch.from_numpy(turn.T.copy())

@@ -101,7 +101,8 @@ def encode(gaussians: ImageGaussians) -> bytes:
         levels = levels[np.argsort(_z_order(levels[:, 0], levels[:, 1]), kind="stable")]
         levels[1:, :2] -= levels[:-1, :2].copy()
     scales = np.stack([low, steps], axis=1).astype("<f4")
-    payload = _byte_planes(levels)
+    # For each column, the low bytes and then the high bytes.
+    payload = levels.astype("<u2").view(np.uint8).reshape(len(levels), -1).T.tobytes()
     head = _HEADER.pack(
         _MAGIC,
         _VERSION,
@@ -150,11 +151,6 @@ def decode(data: bytes) -> ImageGaussians:
         rows=torch.from_numpy(rows),
         background=torch.tensor(background, dtype=torch.float32),
     )
-
-
-def _byte_planes(levels: np.ndarray) -> bytes:
-    """(N, C) uint16 as bytes: for each column, the low bytes and then the high bytes."""
-    return levels.astype("<u2").view(np.uint8).reshape(len(levels), -1).T.tobytes()
 
 
 def _levels(payload: bytes, count: int, columns: int) -> np.ndarray:

@@ -141,7 +141,8 @@ class Fitter:
         the colour of the photo and a low opacity.
         """
         squared = error.square().sum(0) ** _ERROR_POWER
-        x, y = self._sample(_mean_of_3x3(squared), count)
+        around = torch.nn.functional.avg_pool2d(squared[None, None], 3, 1, 1)[0, 0]
+        x, y = self._sample(around, count)
         sigmas = torch.full((count,), max(_NEW_SIGMA * self._spacing, _SMALLEST_SIGMA))
         if self.options.blending == "additive":
             rows = self._new_rows(x, y, sigmas, -0.5 * error[:, y, x].T, opacity=1.0)
@@ -208,11 +209,6 @@ def _gradient_norm(image: Tensor) -> Tensor:
     along_x = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
     along_y = padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]
     return (0.25 * (along_x.square() + along_y.square()).sum(0)).sqrt()
-
-
-def _mean_of_3x3(values: Tensor) -> Tensor:
-    """(H, W): the means over the neighbourhoods of 3×3 pixels."""
-    return torch.nn.functional.avg_pool2d(values[None, None], 3, 1, 1)[0, 0]
 
 
 def column_count(blending: Blending) -> int:

@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.photos.decode import ImageSource, load_image, read_header
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.evaluation.metrics import compare
 from snowsplat.extras.image.compact_file import read_compact, write_compact, write_svg
 from snowsplat.extras.image.fit import COLORS, LOG_SIGMAS, OPACITY_LOGIT, Fitter, ImageGaussians
@@ -186,8 +187,7 @@ def load_photo(photo: Path, size: int) -> Tensor:
     width, height = header.width, header.height
     if header.sideways:
         width, height = height, width
-    scale = min(1.0, size / max(width, height))
-    width, height = (max(1, round(side * scale)) for side in (width, height))
+    width, height = scaled_size(width, height, size)
     planes = load_image(ImageSource(photo, width, height, apply_orientation=True), (1.0, 1.0, 1.0))
     return planes.float().div(255).permute(1, 2, 0)
 

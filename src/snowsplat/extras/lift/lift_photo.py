@@ -30,6 +30,7 @@ from snowsplat.evaluation.metrics import Evaluation, compare
 from snowsplat.extras.lift.lift import lift
 from snowsplat.extras.lift.options import DepthSource, LiftOptions
 from snowsplat.extras.lift.surface import resize_depth
+from snowsplat.extras.pictures import write_pictures
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output.image_files import depth_in_color, write_png
 from snowsplat.pipeline.run.training_files import write_beginning, write_scene
@@ -42,7 +43,6 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.trajectory.orbit import swing_path
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
-from snowsplat.util.files import write_json
 from snowsplat.util.settings import Setting, checked
 
 #: The folder of the dataset that `lift_photo` writes: the photo and its camera.
@@ -154,7 +154,10 @@ def lift_photo(
     Compute("cpu", threads).apply()
     z = read_depth(depth, pixels, camera, options.edge)
     gaussians = lift(pixels, z, camera, options)
-    _begin(out, Path(photo).stem, pixels, camera)
+    settings = DatasetSettings(str((out.path / PHOTO).absolute()))
+    write_pictures(out.path / PHOTO, [Path(photo).stem], [pixels], [camera])
+    out.remove_results()
+    write_beginning(out, read_dataset(settings), settings, TrainConfig(sh_degree=0))
     return finish(out, 0, gaussians, pixels, z, camera, source, swing, started)
 
 
@@ -192,23 +195,6 @@ def read_photo(path: Path, size: int, focal: float | None) -> tuple[Tensor, Came
     return pixels, Camera(width, height, focal, focal, width / 2, height / 2, pose), source
 
 
-def _begin(out: TrainingFolder, name: str, pixels: Tensor, camera: Camera) -> None:
-    """Write the photo as a dataset of one view, and what `train` writes before its first step."""
-    folder = out.path / PHOTO
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    for earlier in (folder / "images").iterdir():
-        earlier.unlink()
-    write_png(folder / "images" / f"{name}.png", to_8bit(pixels))
-    world_from_gl = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))  # the axes of the format
-    frame = {"file_path": f"images/{name}.png", "transform_matrix": world_from_gl.tolist()}
-    intrinsics = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
-    intrinsics |= {"cx": camera.cx, "cy": camera.cy}
-    write_json(folder / "transforms.json", intrinsics | {"frames": [frame]})
-    settings = DatasetSettings(str(folder.absolute()))
-    out.remove_results()
-    write_beginning(out, read_dataset(settings), settings, TrainConfig(sh_degree=0))
-
-
 def finish(
     out: TrainingFolder,
     step: int,
@@ -235,7 +221,11 @@ def finish(
     video = out.path / "swing.mp4"
     video.unlink(missing_ok=True)  # of an earlier run
     if swing:
-        _write_swing(video, gaussians, camera, float(np.median(known)))
+        width, height = (side // 2 * 2 for side in (camera.width, camera.height))  # even
+        path = swing_path(camera, float(np.median(known)), _SWING_SECONDS * _SWING_FPS)
+        with torch.no_grad(), video_writer(video, width, height, _SWING_FPS) as add_frame:
+            for pose in path:
+                add_frame(to_8bit(render(gaussians, pose).image)[:height, :width])
     return LiftResult(
         scene=scene,
         gaussians=len(gaussians),
@@ -245,15 +235,6 @@ def finish(
         seconds=seconds,
         swing=video if swing else None,
     )
-
-
-def _write_swing(target: Path, gaussians: Gaussians, camera: Camera, distance: float) -> None:
-    """A video of the scene on `swing_path`; its size is even."""
-    width, height = (side // 2 * 2 for side in (camera.width, camera.height))
-    cameras = swing_path(camera, distance, _SWING_SECONDS * _SWING_FPS)
-    with torch.no_grad(), video_writer(target, width, height, _SWING_FPS) as add_frame:
-        for pose in cameras:
-            add_frame(to_8bit(render(gaussians, pose).image)[:height, :width])
 
 
 def estimate_depth(model: Path, photo: Tensor) -> np.ndarray:

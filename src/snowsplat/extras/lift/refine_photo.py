@@ -121,9 +121,7 @@ def _with_unseen_points(
     lifted: Gaussians, points: Points, camera: Camera, opacity: float
 ) -> Gaussians:
     """The Gaussians, and one for each point that is outside of the image of the camera."""
-    pixels, z = camera.project(points.xyz.double())
-    inside = (pixels >= 0).all(1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
-    unseen = ~(inside & (z > 0))
+    unseen = ~camera.sees(points.xyz.double())[1]
     if not bool(unseen.any()):
         return lifted
     others = Gaussians.from_points(

@@ -99,7 +99,9 @@ def find_scenes(folder: Path, only: Sequence[str] = ()) -> list[Path]:
 
 
 def _job(dataset: Path, output: Path, name: str, options: BenchmarkOptions) -> Job:
-    suite = SUITES[name]
+    suite, weights = SUITES[name], options.lpips
+    if weights is not None and not is_packaged(weights):
+        weights = weights.absolute()
     return Job(
         dataset.name,
         str(dataset.absolute()),
@@ -107,7 +109,7 @@ def _job(dataset: Path, output: Path, name: str, options: BenchmarkOptions) -> J
         options.recipe,
         {**suite.settings, **options.settings},
         resolution=options.resolution or suite.resolutions.get(dataset.name),
-        lpips=None if options.lpips is None else _lpips(options.lpips),
+        lpips=None if weights is None else str(weights),
     )
 
 
@@ -169,8 +171,3 @@ def _devices(options: BenchmarkOptions) -> list[str | None]:
     if count == 0:
         return [options.device] * options.jobs
     return [f"cuda:{number % count}" for number in range(options.jobs)]
-
-
-def _lpips(weights: Path) -> str:
-    """The name of a network, or the absolute path of a file."""
-    return str(weights if is_packaged(weights) else weights.absolute())

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.ops import neighbours
-from snowsplat.scene.geometry import transform_points
 
 # A photo belongs to a block if at least this share of what it shows is in the cell.
 _SHOWN = 0.25
@@ -90,7 +89,9 @@ def block_content(dataset: Dataset, count: int, margin: float) -> tuple[Axes, li
             continue
         kept = cell.contains(ground, border)
         others = (~kept).nonzero()[:, 0]
-        others = others[_visible(own, xyz[others])]
+        some = own[:: -(-len(own) // _TESTED_VIEWS)]
+        seen = [view.camera.sees(xyz[others])[1] for view in some]
+        others = others[torch.stack(seen).any(0)]
         chosen = torch.randperm(len(others), generator=generator)
         kept[others[chosen[: round(_OUTSIDE * int(kept.sum()))]]] = True
         selected = Points(points.xyz[kept], points.rgb[kept])
@@ -109,28 +110,11 @@ def _shown(views: list[View], xyz: Tensor, cells: list[Cell], ground: Tensor) ->
     members = torch.stack([cell.contains(ground) for cell in cells], 1).to(torch.float64)
     rows = []
     for view in views:
-        depth, visible = _projected(view, xyz)
+        depth, visible = view.camera.sees(xyz)
         angle = spacing / torch.where(visible, depth, 1.0)
         weights = angle.clamp(max=_WIDEST).square() * visible
         rows.append(weights @ members / weights.sum().clamp(min=1e-300))
     return torch.stack(rows)
-
-
-def _visible(views: list[View], xyz: Tensor) -> Tensor:
-    """(P,) bool: whether a view has a point in its image; of many views, some are tested."""
-    step = -(-len(views) // _TESTED_VIEWS)
-    seen = torch.zeros(len(xyz), dtype=torch.bool)
-    for view in views[::step]:
-        seen |= _projected(view, xyz)[1]
-    return seen
-
-
-def _projected(view: View, xyz: Tensor) -> tuple[Tensor, Tensor]:
-    """Depths (P,) of points in a view, and whether they are in its image."""
-    camera = view.camera
-    x, y, z = transform_points(camera.cam_from_world.to(torch.float64), xyz).unbind(1)
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    return z, (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
 
 
 @dataclass(frozen=True)

@@ -234,7 +234,7 @@ def write_block_dataset(
     written = []
     worst = 0.0
     for image in posed:
-        name = _file_name(image)
+        name = image.name + image.path.suffix * (not image.name.endswith(image.path.suffix))
         if image.divided > 1:
             _link(image.path, folder / f"images_{image.divided}" / name)
             continue
@@ -263,12 +263,6 @@ def write_block_dataset(
         write_posed(model, written)
     else:
         write_posed(model, written, points.xyz.double().numpy() + origin, points.rgb.numpy())
-
-
-def _file_name(image: PosedImage) -> str:
-    """The name of a photo in the model: the name of the view, with the suffix of its file."""
-    suffix = image.path.suffix
-    return image.name if image.name.endswith(suffix) else image.name + suffix
 
 
 def _link(file: Path, link: Path) -> None:

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.ply import read_ply, write_ply_parts
-from snowsplat.pipeline.blocks.content import Axes, Cell
+from snowsplat.pipeline.blocks.content import Cell
 from snowsplat.pipeline.blocks.plan import Block, Plan
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
@@ -23,7 +22,6 @@ from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.results import TrainResult
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import DATASET, SCENE, TrainingFolder
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import atomic_path
@@ -224,20 +222,16 @@ def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged
     return Merged(scene, tuple(counts), tuple(trained))
 
 
-def _deviations(gaussians: Gaussians, axes: Axes) -> Tensor:
-    """(N, 2) standard deviations along the axes of the ground plane."""
-    rotations = rotation_from_quat(gaussians.quats)  # its columns are the axes of the Gaussian
-    along = torch.tensor(axes, dtype=rotations.dtype) @ rotations
-    return (along * gaussians.log_scales.exp()[:, None]).norm(dim=2).double()
-
-
 def _own(plan: Plan, cell: Cell, file: Path) -> Callable[[], tuple[int, GaussianArrays]]:
     """Reads a block: its number of Gaussians, and the Gaussians in its cell."""
 
     def read() -> tuple[int, GaussianArrays]:
         arrays = read_ply(file).seen_from(plan.origin)
         gaussians = arrays.to_gaussians()
-        reach = _REACH * _deviations(gaussians, plan.axes)
+        rotations = rotation_from_quat(gaussians.quats)  # its columns are the axes of the Gaussian
+        along = torch.tensor(plan.axes, dtype=rotations.dtype) @ rotations
+        # Standard deviations along the axes of the ground plane.
+        reach = _REACH * (along * gaussians.log_scales.exp()[:, None]).norm(dim=2).double()
         own = cell.contains(plan.ground(gaussians.means), reach)
         return len(gaussians), arrays.select(own.numpy())
 

@@ -147,20 +147,17 @@ class Watchers:
         waited = 0.0
         if self._asking or self._deserted:
             started = time.monotonic()
-            self._open_or_close()
+            with self._lock:
+                self._deserted = False
+                asking, self._asking = self._asking, []
+                for connection, request in asking:
+                    self._answer(connection, request)
+                if not self._watching:
+                    self._close_page()
             waited = time.monotonic() - started
         if self._page is not None and (training := self._page.training) is not None:
             waited += training.after_step(step, steps, loss, gaussians)
         return waited
-
-    def _open_or_close(self) -> None:
-        with self._lock:
-            self._deserted = False
-            asking, self._asking = self._asking, []
-            for connection, request in asking:
-                self._answer(connection, request)
-            if not self._watching:
-                self._close_page()
 
     def _answer(self, connection: Connection, request: PageRequest) -> None:
         viewer = None if self._page is None else self._page.viewer

@@ -143,11 +143,6 @@ class TrainingRun:
         # If there are metrics, the time of the step includes an evaluation and is not counted.
         timed = progress.metrics is None
         self.history.step_ends(progress.step, progress.loss, progress.gaussians, timed=timed)
-        self._after_step(progress)
-        self.together.proceed()
-        self.history.step_begins()
-
-    def _after_step(self, progress: Progress) -> None:
         if progress.metrics is not None:
             self._record_evaluation(progress.step, progress.metrics)
         schedule, step = self.trainer.schedule, progress.step
@@ -166,6 +161,8 @@ class TrainingRun:
                 self.budget.started += paused
         if length is not None:
             self.together.stretch(step, length)
+        self.together.proceed()
+        self.history.step_begins()
 
     def _left_out(self) -> tuple[LeftOut, ...]:
         views = self.trainer.dataset.train

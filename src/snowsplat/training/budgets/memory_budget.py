@@ -194,7 +194,10 @@ def plan_memory(
     )
     stored = max(largest, *(view.image.stored for view in dataset.train))
     images = cost.bytes_for(0, largest, config.sh_degree) + cost.decoding * stored
-    all_photos = _photo_bytes(dataset)
+    all_photos = sum(
+        (_RGB + (_MASK if view.mask else 0)) * view.camera.width * view.camera.height
+        for view in dataset.train
+    )
     photos = min(all_photos, config.image_memory or available // 2)
     limit = config.density.max_gaussians or None
     reductions = []
@@ -220,14 +223,6 @@ def plan_memory(
     gaussians = 1_000_000 if limit is None else limit
     whole = scene.bytes_for(gaussians)
     return MemoryPlan(config, whole, images, photos, tuple(reductions), limit, device)
-
-
-def _photo_bytes(dataset: Dataset) -> int:
-    """Bytes of all decoded training photos with their masks."""
-    return sum(
-        (_RGB + (_MASK if view.mask else 0)) * view.camera.width * view.camera.height
-        for view in dataset.train
-    )
 
 
 def _too_little(budget: int, least: int, present: int, files_too_large: bool) -> SettingError:

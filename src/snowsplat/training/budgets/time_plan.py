@@ -10,6 +10,7 @@ import math
 import statistics
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -101,11 +102,13 @@ class Plan:
         size = message("{width}x{height}", width=self.width, height=self.height)
         if self.resolution is not None:
             size = message("photos reduced to {size}", size=size)
+        digits = 2 - len(str(self.config.iterations))
+        steps = round(self.config.iterations, min(0, digits))
         return message(
             "{size}, {gaussians}, about {steps:,} steps",
             size=size,
             gaussians=gaussians,
-            steps=_rounded(self.config.iterations),
+            steps=steps,
         )
 
 
@@ -221,17 +224,10 @@ def measure_time_ratio(
 
 def _at_most_max_side(view: View) -> View:
     """The view, reduced to `_MAX_SIDE` if it is larger."""
-    camera, mask = view.camera, view.mask
-    scale = _MAX_SIDE / max(camera.width, camera.height)
-    if scale >= 1.0:
-        return view
-    width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
-    return replace(
-        view,
-        camera=camera.scaled(width, height),
-        image=replace(view.image, width=width, height=height),
-        mask=mask and replace(mask, width=width, height=height),
-    )
+    camera = view.camera.reduced(_MAX_SIDE)
+    size: dict[str, Any] = {"width": camera.width, "height": camera.height}
+    mask = view.mask and replace(view.mask, **size)
+    return replace(view, camera=camera, image=replace(view.image, **size), mask=mask)
 
 
 def _capped(config: TrainConfig, pixels: int, gaussian_factor: float) -> TrainConfig:
@@ -301,9 +297,3 @@ def _steps(work: Work, seconds: float, time_ratio: float, gaussians: int) -> tup
         )
         steps = max(FEWEST_STEPS, round(left / mean))
     return steps, mean
-
-
-def _rounded(count: int) -> int:
-    """``count``, rounded to two significant digits."""
-    digits = max(0, len(str(count)) - 2)
-    return round(count / 10**digits) * 10**digits

@@ -71,7 +71,7 @@ def distill(
     order: list[int] = []
     for step in range(1, steps + 1):
         order = order or torch.randperm(len(cameras), generator=random).tolist()
-        camera = _reduced(cameras[order.pop()])
+        camera = cameras[order.pop()].reduced(_SIDE)
         wanted = render(teacher, camera, background).image
         splats = project(student, camera)
         splats.packed.requires_grad_()
@@ -82,8 +82,3 @@ def distill(
         optimizer.step(student, [ViewGradient(splats, camera, student.sh_degree)], step)
         on_step(step, float(loss))
     return student
-
-
-def _reduced(camera: Camera) -> Camera:
-    share = min(1.0, _SIDE / max(camera.width, camera.height))
-    return camera.scaled(max(1, round(share * camera.width)), max(1, round(share * camera.height)))

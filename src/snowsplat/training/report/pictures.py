@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data import ImageLoader, View
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.evaluation.metrics import Evaluation, Rendering, ViewMetrics, renderings
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import in_colors, to_8bit
@@ -84,9 +85,7 @@ def _compared(drawn: Rendering, metrics: ViewMetrics) -> Compared:
 def reduced(pixels: np.ndarray) -> Image.Image:
     """(H, W, 3) uint8 as an image whose longer side has at most `_IMAGE_SIDE` pixels."""
     image = Image.fromarray(pixels)
-    scale = min(1.0, _IMAGE_SIDE / max(image.size))
-    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
-    return image.resize(size, Image.Resampling.LANCZOS)
+    return image.resize(scaled_size(*image.size, _IMAGE_SIDE), Image.Resampling.LANCZOS)
 
 
 @dataclass(frozen=True)

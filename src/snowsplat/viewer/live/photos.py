@@ -18,9 +18,10 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.data import View
 from snowsplat.data.photos.decode import load_image
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.live.pictures import Photo, PhotoRectangle, fit
+from snowsplat.viewer.live.pictures import Photo, PhotoRectangle
 from snowsplat.viewer.live.session import PhotoView, Session
 
 _LENGTH = 0.6  # length of a frustum, relative to the distance of neighbouring cameras
@@ -100,7 +101,7 @@ class Photos:
 
     def _load(self, view: View, longest: int) -> np.ndarray:
         """(h, w, 3) uint8: the photo, not larger than this. Raises: UserError."""
-        width, height = fit(view.image.width, view.image.height, longest)
+        width, height = scaled_size(view.image.width, view.image.height, longest)
         small = dataclasses.replace(view.image, width=width, height=height)
         planes = load_image(small, self._background.tolist())
         return planes.permute(1, 2, 0).contiguous().numpy()

@@ -171,7 +171,9 @@ def _axes(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> tuple[Tenso
     ids = splats.ids.long()
     unit = torch.eye(3, dtype=gaussians.quats.dtype, device=gaussians.quats.device)
     shortest = unit[gaussians.log_scales[ids].argmin(1)]
-    axes = _rotated(gaussians.rotations[ids], shortest)
+    w, q = gaussians.rotations[ids].split([1, 3], 1)
+    # v + 2 q × (q × v + w v)
+    axes = shortest + 2.0 * torch.linalg.cross(q, torch.linalg.cross(q, shortest) + w * shortest)
     to_camera = camera.position.to(axes) - gaussians.means[ids]
     facing = (axes * to_camera).sum(1)
     axes = torch.where(facing[:, None] < 0, -axes, axes)
@@ -179,23 +181,14 @@ def _axes(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> tuple[Tenso
     return axes @ camera.cam_from_world[:, :3].T.to(axes), straight
 
 
-def _rotated(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors (M, 3) rotated by unit quaternions wxyz (M, 4): v + 2 q × (q × v + w v)."""
-    w, q = quats[:, :1], quats[:, 1:]
-    return vectors + 2.0 * torch.linalg.cross(q, torch.linalg.cross(q, vectors) + w * vectors)
-
-
-def _recolored(splats: Splats2D, colors: Tensor) -> Splats2D:
-    packed = splats.packed.clone()
-    packed[:, COLORS : COLORS + 3] = colors
-    return Splats2D(packed, splats.ids, splats.channels)
-
-
 def _normals(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> Tensor:
     """Red: right, green: up, blue: towards the camera."""
     axes, _ = _axes(splats, gaussians, camera)
     # The axes are blended as colours, then normalised: this gives the direction of the mean axis.
-    image, alpha, _ = ops.rasterize(_recolored(splats, axes), camera.width, camera.height)
+    packed = splats.packed.clone()
+    packed[:, COLORS : COLORS + 3] = axes
+    coloured = Splats2D(packed, splats.ids, splats.channels)
+    image, alpha, _ = ops.rasterize(coloured, camera.width, camera.height)
     length = image.permute(2, 0, 1).square().sum(0).sqrt_().clamp_min_(1e-9)  # plane by plane
     normals = image / length[:, :, None] * image.new_tensor([0.5, -0.5, -0.5])
     return _bytes((normals + 0.5) * (alpha >= _MIN_ALPHA)[:, :, None])
@@ -326,12 +319,6 @@ class View:
         pose = torch.cat([rotation, position[:, None]], 1)
         cx, cy = 0.5 * width, 0.5 * height
         return Camera(width, height, focal, focal, cx, cy, invert_rigid(pose), near)
-
-
-def fit(width: int, height: int, longest: int) -> tuple[int, int]:
-    """The size, reduced if necessary, so that its longer side is at most ``longest``."""
-    scale = min(1.0, longest / max(width, height))
-    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 @dataclass(frozen=True)

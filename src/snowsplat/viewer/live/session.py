@@ -14,8 +14,9 @@ from typing import Literal
 
 import numpy as np
 
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.scene.camera import Camera
-from snowsplat.viewer.live.pictures import Display, View, fit
+from snowsplat.viewer.live.pictures import Display, View
 
 STILL = 0.2  # seconds without motion after which a camera counts as still
 # While the camera moves, images are made so small that rendering takes at most this many seconds.
@@ -82,7 +83,7 @@ class Visitor:
         """
         if self.view is None or self.on_the_way >= _ON_THE_WAY:
             return None
-        full = fit(self.view.width, self.view.height, self.display.longest)
+        full = scaled_size(self.view.width, self.view.height, self.display.longest)
         moving = now - self.changed < STILL
         kind: Literal["moving", "still", "idle"]
         if moving and self.shown_version != self.version:
@@ -100,10 +101,10 @@ class Visitor:
     def _moving_size(self, full: tuple[int, int]) -> tuple[int, int]:
         """A size that can be rendered fast enough, estimated from the times of previous images."""
         if not self.seconds_per_pixel:
-            return fit(*full, max(full) // 2)
+            return scaled_size(*full, max(full) // 2)
         pixels = _MOVING_SECONDS / self.seconds_per_pixel
         scale = min(1.0, (pixels / (full[0] * full[1])) ** 0.5)
-        return fit(*full, max(round(max(full) * scale), _MIN_SIDE))
+        return scaled_size(*full, max(round(max(full) * scale), _MIN_SIDE))
 
     def record_rendering(self, request: RenderRequest, scene: int, seconds: float) -> None:
         """Record that the image was rendered in ``seconds``."""

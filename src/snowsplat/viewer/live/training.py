@@ -14,6 +14,7 @@ from torch import Tensor
 
 from snowsplat.data import View
 from snowsplat.data.photos.decode import load_image, load_mask, resize_area
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
@@ -21,7 +22,6 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.interrupts import raise_deferred_interrupt
 from snowsplat.util.messages import Message
 from snowsplat.util.process import single_threaded
-from snowsplat.viewer.live.pictures import fit
 from snowsplat.viewer.live.viewer import NetworkViewer
 
 _SECONDS = 1.0  # time between two updates of the displayed numbers
@@ -197,7 +197,7 @@ class SampledPsnr:
     @torch.no_grad()
     def _measure_next(self, gaussians: Gaussians) -> None:
         view = next(self._turn)
-        size = fit(view.camera.width, view.camera.height, _MAX_SIDE)
+        size = scaled_size(view.camera.width, view.camera.height, _MAX_SIDE)
         with single_threaded():
             try:
                 photo, mask = self._photo(view, size)

@@ -117,7 +117,9 @@ def page(
     text = _replaced(text, "noanim: url.searchParams.has('noanim')", "noanim: true")
     parts = _SLOT.split(text)
     assert len(parts) == 4, "the viewer's page has no bootstrap"
-    return parts[0] + parts[1] + _json_in_script(bootstrap) + parts[2] + parts[3]
+    # "<" could end the script element or begin a comment in it.
+    data = json.dumps(bootstrap).replace("<", "\\u003c")
+    return parts[0] + parts[1] + data + parts[2] + parts[3]
 
 
 def whole_page(title: str, bootstrap: Mapping[str, Any], body: str) -> str:
@@ -181,8 +183,3 @@ def _replaced(text: str, old: str, new: str) -> str:
     assert text.count(old) == 1, f"the viewer's page does not contain {old} exactly once"
     before, after = text.split(old)
     return before + new + after
-
-
-def _json_in_script(value: Any) -> str:
-    # "<" could end the script element or begin a comment in it.
-    return json.dumps(value).replace("<", "\\u003c")
