@@ -10,6 +10,7 @@ docs/pictures. Nothing is made that is there already.
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ import torch
 from PIL import Image
 
 import snowsplat
+from snowsplat.extras.anamorph.make_anamorph import make_anamorph
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.render import render, to_8bit
 from snowsplat.synthetic.photographer import write_synthetic_photos
@@ -68,12 +70,15 @@ def picture(made: Path, target: Path) -> None:
 
 def main(names: list[str]) -> None:
     PAGES.mkdir(parents=True, exist_ok=True)
-    for name in names or [*SCENES, "globe"]:
+    for name in names or [*SCENES, "globe", "anamorph"]:
         page = PAGES / f"gallery-{name}.html"
         target = ROOT / "docs" / "pictures" / f"gallery-{name}.webp"
         if page.exists():
             continue
-        if name == "globe":  # its picture is one of docs/pictures.py
+        if name == "anamorph":  # its picture is that of its guide
+            pictures = [target.with_name(f"gallery-{scene}.webp") for scene in SCENES]
+            shutil.copy(make_anamorph(pictures, WORK / name, overwrite=True).page, page)
+        elif name == "globe":  # its picture is one of docs/pictures.py
             snowsplat.make_globe(make(GLOBE), page, snowsplat.GlobeOptions(name="snowsplat"))
         else:
             made = make(name)

@@ -9,7 +9,7 @@ const EMBED =
     '<iframe src="https://example.org/scene/index.html" title="3D scene" allow="fullscreen; xr-spatial-tracking" style="width: 100%; aspect-ratio: 16 / 9; border: 0"></iframe>';
 
 /** What a kind of file is called, if it is not the end of its name. @type {Record<string, string>} */
-const NAMES = { glb: "glTF (splats)", mesh: "glTF (mesh)", ar: "USDZ (AR)" };
+const NAMES = { glb: "glTF (splats)", mesh: "glTF (mesh)", points: "PLY (points)", ar: "USDZ (AR)" };
 
 export function resultPart(
     /** @type {import("./scene.js").ScenePage} */ page,

@@ -26,17 +26,18 @@ function showStart(/** @type {AbortSignal} */ closed) {
     document.title = "snowsplat studio";
     const files = make("input", { type: "file", multiple: true, change: picked });
     const folder = make("input", { type: "file", webkitdirectory: true, change: picked });
+    const touch = matchMedia("(pointer: coarse)").matches; // phones cannot drop or choose a folder
     const zone = make(
         "section.drop",
         {},
         make("h1", {}, say("title")),
-        make("p", {}, say("drop")),
+        make("p", {}, say(touch ? "give" : "drop")),
         make("p.soft", {}, say("advice")),
         make(
             "div.row",
             {},
             make("label.button.main", {}, say("choose_files"), files),
-            make("label.button.plain", {}, say("choose_folder"), folder),
+            !touch && make("label.button.plain", {}, say("choose_folder"), folder),
             make("button.plain", { type: "button", click: action(example) }, say("try_example")),
         ),
         make("p.soft", {}, say("private")),

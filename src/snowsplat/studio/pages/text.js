@@ -13,6 +13,10 @@ const TEXTS = {
         "Drop photos, a folder, a zip file or a video here; or a finished scene: .ply, .spz, .sog, .glb",
         "把照片、文件夹、zip 文件或视频拖到这里；也可以是已完成的场景：.ply、.spz、.sog、.glb",
     ],
+    give: [
+        "Photos, a zip file or a video; or a finished scene: .ply, .spz, .sog, .glb",
+        "照片、zip 文件或视频；也可以是已完成的场景：.ply、.spz、.sog、.glb",
+    ],
     advice: [
         "30 to 100 sharp photos of one object or place from all sides, or a slow video. Each photo shows most of what the one before shows.",
         "围绕一个物体或地方，从各个方向拍 30 到 100 张清晰的照片，或一段缓慢移动的视频。每张照片都应包含前一张的大部分内容。",
