@@ -14,6 +14,8 @@ from snowsplat import data
 from snowsplat.data import ImageLoader, Points, load_dataset, read_files
 from snowsplat.data.dataset import safe_name
 from snowsplat.data.frame.bounds import scene_bounds, scene_extent
+from snowsplat.data.hold_out import held_out_names
+from snowsplat.data.readers import read_poses
 from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import SettingError, UserError
@@ -45,6 +47,7 @@ def test_every_eighth_image_by_name_is_held_out(pristine):
     assert [view.name for view in between.test] == ["view_01.png", "view_04.png", "view_07.png"]
     (middle,) = load_dataset(pristine["colmap-bin"], first_held_out=20).test
     assert middle.name == "view_04.png"
+    assert not held_out_names(read_poses(pristine["colmap-bin"]).images[:1], 8, 0, None)
     with pytest.raises(SettingError, match="-1 is not valid"):
         load_dataset(pristine["colmap-bin"], first_held_out=-1)
     everything = load_dataset(pristine["colmap-bin"], hold_out=None)

@@ -216,4 +216,8 @@ def test_positions_that_a_file_has_rounded_are_named(tmp_path, make_scene, caplo
     scene.means += torch.from_numpy(UTM).float()
     write_gaussians(tmp_path / "a.ply", scene)
     read_gaussians(tmp_path / "a.ply")
-    assert "rounded to steps of 0.5" in caplog.text
+    assert caplog.text.count("rounded to steps of 0.5") == 1
+    scene.log_scales[:] = -27.6  # points, as another program writes a scale of 0
+    write_gaussians(tmp_path / "a.ply", scene)
+    read_gaussians(tmp_path / "a.ply")
+    assert caplog.text.count("rounded to steps") == 1

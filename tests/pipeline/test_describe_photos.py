@@ -40,6 +40,12 @@ def test_a_video_is_described(tmp_path):
 def test_a_folder_without_photos_and_poses_is_refused(tmp_path):
     with pytest.raises(UserError, match="no camera poses here"):
         describe(tmp_path)
+    (tmp_path / "1.dng").write_bytes(b"II*\0")
+    with pytest.raises(UserError, match="has 1 DNG photo, which cannot be read"):
+        describe(tmp_path)
+    (tmp_path / "1.jpg").write_bytes(b"\xff\xd8\xff nothing")
+    with pytest.raises(UserError, match="none of its 1 photos can be used .* cannot be decoded"):
+        describe(tmp_path)
 
 
 def test_a_zip_file_is_described_and_not_unpacked(tmp_path):

@@ -34,6 +34,8 @@ def held_out_names(
     if any(image.split == "test" for image in posed):
         return {image.name for image in posed if image.split == "test"}
     frames = list(dict.fromkeys(together[name] for name in names))
+    if len(frames) < 2:  # else no image is left for training
+        return set()
     chosen = frames[first::hold_out] or [frames[len(frames) // 2]]
     return {name for frame in chosen for name in frame}
 

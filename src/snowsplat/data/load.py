@@ -75,7 +75,7 @@ def load_dataset(
             is held out for testing. If the dataset has its own split, this split is used instead.
             None: no image is held out, even if the dataset has its own split.
         first_held_out: index of the first of these images. 0 is the protocol of the papers. If
-            there are not so many images, the middle one is held out.
+            there are not so many images, the middle one is held out; the only one is not.
         test_list: names of the test images, or a text file with one name per line. It replaces
             ``hold_out`` and the dataset's own split.
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _SAMPLE = 1 << 14  # Gaussians from which precision is estimated
+_POINT = 1e-11  # a standard deviation of 0 is read as 1e-12
 
 __all__ = [
     "FORMATS",
@@ -79,7 +80,8 @@ def _name_coarse_positions(path: Path, scene: GaussianArrays) -> None:
         return
     farthest = float(np.abs(np.median(sample.means, 0)).max())
     step = float(np.spacing(np.float32(farthest)))
-    if step > 0.1 * math.exp(min(80.0, float(np.median(sample.log_scales.max(1))))):
+    size = math.exp(min(80.0, float(np.median(sample.log_scales.max(1)))))
+    if 0.1 * size < step and size > _POINT:
         logger.warning(
             "%s: its positions are rounded to steps of %.2g, because they are %.4g from 0; export "
             "it nearer to 0, or as a PLY with doubles",

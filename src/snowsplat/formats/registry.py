@@ -34,6 +34,10 @@ from snowsplat.util.messages import Message, message
 _HEAD_BYTES = 16_384
 
 
+class UnknownFormatError(UserError):
+    """A file is of none of the known formats."""
+
+
 @dataclass(frozen=True)
 class Format:
     """One format of scene files.
@@ -235,7 +239,7 @@ def format_for_reading(path: Path | str) -> Format:
     named = _by_suffix(path, FORMATS)
     if named is None:
         known = _suffixes([format for format in FORMATS if format.read is not None])
-        raise UserError(
+        raise UnknownFormatError(
             "{path}: not a known scene file; supported are {known}", path=path, known=known
         )
     return named

@@ -13,6 +13,7 @@ from snowsplat.data.photos.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from snowsplat.data.points_ply import read_points
 from snowsplat.formats import Format, GaussianArrays, ply
 from snowsplat.formats.lod import LEVELS, read_index
+from snowsplat.formats.registry import UnknownFormatError
 from snowsplat.pipeline.output.scene_files import format_for_reading, read_arrays
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.project.left_out import LeftOut
@@ -66,10 +67,7 @@ def describe(path: Path | str) -> dict[str, Any]:
         try:
             format = format_for_reading(path)
         except UserError as error:
-            if path.suffix != ".json" and not _is_export(path):  # it may be a dataset
-                unknown = UserError(
-                    "{error}, checkpoints, datasets, photos and videos", error=error
-                )
+            if (unknown := _no_dataset(path, error)) is not None:
                 return _photos(path, unknown)
         else:
             return _scene(path, format)
@@ -185,11 +183,11 @@ def _left_out(found: Sequence[LeftOut]) -> dict[str, Any]:
 def _photos(path: Path, otherwise: UserError) -> dict[str, Any]:
     """What `describe_photos` says. Raises ``otherwise`` if there are no photos and no videos."""
     from snowsplat.pipeline.describe_photos import describe_photos  # pycolmap and torch
-    from snowsplat.sfm.ingest.search.sources import find_sources
+    from snowsplat.sfm.ingest.search.sources import NothingFoundError, find_sources
 
     try:
         sources = find_sources([path])
-    except UserError:
+    except NothingFoundError:
         raise otherwise from None
     return describe_photos(sources)
 
@@ -213,10 +211,17 @@ def _zip(path: Path) -> dict[str, Any]:
         return describe_zip(path)
 
 
-def _is_export(path: Path) -> bool:
-    from snowsplat.data.readers import is_export  # torch
+def _no_dataset(path: Path, error: UserError) -> UserError | None:
+    """What to do with a file that is no scene; None: it may be a dataset."""
+    from snowsplat.data.readers import advice, is_export  # torch
 
-    return is_export(path)
+    if path.suffix == ".json" or is_export(path):
+        return None
+    if (known := advice(path)) is not None:
+        return UserError("{path}: {known}", path=path, known=known)
+    if not isinstance(error, UnknownFormatError):
+        return error
+    return UserError("{error}, checkpoints, datasets, photos and videos", error=error)
 
 
 def _dataset(path: Path) -> dict[str, Any]:

@@ -19,12 +19,12 @@ from snowsplat.sfm.ingest.search.archive import files_in
 from snowsplat.sfm.ingest.search.sources import Source, Sources
 from snowsplat.sfm.ingest.video.clip import max_frame_count, read_clip
 from snowsplat.util.duration import duration
+from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 from snowsplat.util.messages import Message, message
 
 # So many files that are not used are named; the others are counted.
 _NAMED = 5
-_NO_PHOTO = message("has no photo")  # a mask
 
 
 def describe_photos(sources: Sources) -> dict[str, Any]:
@@ -41,6 +41,14 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
             usable.append(read_header(source.path))
         except Unusable as error:
             left_out.append(LeftOut(shown(source.path), "photos", error.message))
+    if not (usable or sources.videos):
+        raise UserError(
+            "{path}: none of its {count} photos can be used ({name} {why})",
+            path=path,
+            count=len(sources.photos),
+            name=left_out[-1].photo,
+            why=left_out[-1].reason,
+        )
     photos = survey(sources)
     speed = measure_speed(thread_count(None))
     time = duration(predicted_seconds(photos, PRESETS["normal"].photos, "normal", speed))

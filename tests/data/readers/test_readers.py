@@ -314,12 +314,43 @@ def test_the_folder_of_an_unpacked_archive_may_be_inside(tmp_path):
     assert photo_folder(tmp_path) == ("Polycam", photos)
 
 
-@pytest.mark.parametrize("name", ["garden.psx", "Garden.rcproj", "sfm_data.bin", "scan.r3d"])
+UNREAD = "garden.psx Garden.rcproj sfm_data.bin scan.r3d a.nvm calibrated_camera_parameters.txt"
+
+
+@pytest.mark.parametrize(
+    "name", [*UNREAD.split(), "b/a.mvs", "kapture/sensors/trajectories.txt", "sparse/0/cameras.bin"]
+)
 def test_projects_that_are_not_readable_are_explained(name, tmp_path):
     exports.photos(tmp_path / "images")
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).touch()
-    with pytest.raises(NoPosesError, match=rf"{name} is .*; (export|convert|unpack)"):
+    with pytest.raises(NoPosesError, match=rf"{name} is .*; (export|convert|unpack|put)"):
         load_dataset(tmp_path)
+    assert f"{name} is " in str(describe(tmp_path)["camera_poses"])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.nvm", "NVM_V3", "a.nvm is a file of VisualSFM; export bundle.out and list.txt$"),
+        ("a.obj", "v 0 0 0", "not a known scene file.*, checkpoints, datasets, photos and videos$"),
+        ("a.ply", "version https://git-lfs.github.com/spec/v1\n", "run git lfs pull$"),
+    ],
+)
+def test_other_files_are_explained(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(UserError, match=message):
+        describe(tmp_path / name)
+
+
+def test_an_export_in_a_folder_without_photos_is_that_of_the_photos_above(tmp_path):
+    exports.alicevision(tmp_path)
+    (tmp_path / "cache/0a1b").mkdir(parents=True)
+    [file] = tmp_path.glob("*.sfm")
+    file.rename(tmp_path / "cache/0a1b/cameras.sfm")
+    assert len(read_poses(tmp_path).images) == 4
+    exports.photos(tmp_path / "cache/0a1b")  # a dataset of its own
+    assert find_poses(tmp_path) is None
 
 
 @pytest.mark.parametrize(
@@ -328,6 +359,7 @@ def test_projects_that_are_not_readable_are_explained(name, tmp_path):
         ("pose/0.txt", "1 0 0 0\n0 1 0 0\n", "ScanNet"),
         ("groundtruth.txt", "# time x y z\n1.5 0 0 1 0 0 0 1\n", "TUM"),
         ("poses.txt", "1e0 0 0 0 0 1 0 0 0 0 1 0\n", "KITTI"),
+        ("frame-000000.pose.txt", "1 0 0 0\t\n0 1 0 0\n", "7-Scenes"),
         ("a/b.txt", "1 0 0 0\n", None),
         ("poses.txt", "poses: none\n", None),
     ],

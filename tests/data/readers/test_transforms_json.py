@@ -59,6 +59,7 @@ FIELD = 2 * math.atan(0.4)  # 40 pixels at a focal length of 50
     ("common", "expected"),
     [
         ({"camera_angle_x": FIELD}, (50, 50, 20, 15)),
+        ({"K": [[50, 0, 20], [0, 50, 15], [0, 0, 1]], "w": 40, "h": 30}, (50, 50, 20, 15)),
         ({"camera_angle_x": FIELD, "camera_angle_y": 2 * math.atan(0.3)}, (50, 50, 20, 15)),
         ({"x_fov": math.degrees(FIELD)}, (50, 50, 20, 15)),
         ({"fl_x": 0.5, "fl_y": 0.75}, (0.5, 0.75, 20, 15)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from snowsplat.data.colmap.model import count_images, model_is_text
@@ -37,18 +37,7 @@ def find_models_below(root: Path, images: str) -> list[Path]:
 
     Raises: UserError: there are several datasets.
     """
-    models = []
-    queue, seen = deque([(root, 0)]), 0
-    while queue and (seen := seen + 1) <= _MOST_FOLDERS:
-        folder, depth = queue.popleft()
-        if model_is_text(folder) is not None:
-            models.append(folder)
-        if depth < _DEEPEST:
-            try:
-                inner = sorted(p for p in folder.iterdir() if p.is_dir())
-            except OSError:
-                continue
-            queue += [(p, depth + 1) for p in inner if not (p.name[0] == "." or is_output(p))]
+    models = [path for path in folders_below(root, _DEEPEST) if model_is_text(path) is not None]
     # The model in sparse/0 beside dense/0 may be one of photos that are not there.
     complete = [m for m in models if (workspace_of(m, root, images) / images).is_dir()]
     models = complete or models
@@ -65,6 +54,20 @@ def find_models_below(root: Path, images: str) -> list[Path]:
             names=names,
         )
     return _largest_first(models)
+
+
+def folders_below(root: Path, deepest: int) -> Iterator[Path]:
+    """A folder and those in it, the nearest first, without hidden ones and outputs of snowsplat."""
+    queue, seen = deque([(root, 0)]), 0
+    while queue and (seen := seen + 1) <= _MOST_FOLDERS:
+        folder, depth = queue.popleft()
+        yield folder
+        if depth < deepest:
+            try:
+                inner = sorted(p for p in folder.iterdir() if p.is_dir())
+            except OSError:
+                continue
+            queue += [(p, depth + 1) for p in inner if not (p.name[0] == "." or is_output(p))]
 
 
 def workspace_of(model: Path, root: Path, images: str) -> Path:

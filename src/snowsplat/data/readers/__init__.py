@@ -7,9 +7,12 @@ A reader is a module with a `Reader`, and a line in `READERS`. Nothing here undi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
+from snowsplat.data.colmap.places import folders_below
 from snowsplat.data.files.photo_files import photos_below
+from snowsplat.data.photos.decode import is_photo
 from snowsplat.data.readers import (
     alicevision,
     bundler,
@@ -44,6 +47,8 @@ PROGRAMS = (
 )
 #: All readers; the first one that finds its files in a folder is used.
 READERS = (colmap.READER, transforms_json.READER, *PROGRAMS)
+# Where the export of a program is searched: MeshroomCache/StructureFromMotion/UID.
+_DEEPEST = 3
 
 
 class NoPosesError(UserError):
@@ -63,8 +68,8 @@ def find_poses(root: Path, images: str = "images", *, deep: bool = True) -> Pose
 
     Args:
         images: name of the folder of images.
-        deep: also models of COLMAP in other folders than ``sparse``, which may be those of other
-            photos.
+        deep: also models of COLMAP in other folders than ``sparse``, and exports of programs in
+            folders without photos, which may be those of other photos.
 
     Raises: UserError: there are several datasets.
     """
@@ -72,7 +77,22 @@ def find_poses(root: Path, images: str = "images", *, deep: bool = True) -> Pose
     for reader in (*PROGRAMS, transforms_json.READER) if root.is_file() else READERS:
         if files := reader.find(root, images, deep):
             return Poses(reader, files)
-    return None
+    below = islice(folders_below(root, _DEEPEST), 1, None) if deep and root.is_dir() else ()
+    found = [
+        Poses(reader, files)
+        for folder in below
+        if not _has_photos(folder)
+        for reader in PROGRAMS
+        if (files := reader.find(folder, images, False)) and not _has_photos(files[0].parent)
+    ]
+    return max(found, key=lambda poses: poses.files[0].stat().st_size, default=None)
+
+
+def _has_photos(folder: Path) -> bool:
+    try:
+        return any(is_photo(path.name) for path in folder.iterdir())
+    except OSError:  # a folder that cannot be read
+        return False
 
 
 def poses_in(root: Path) -> Path | None:

@@ -16,6 +16,8 @@ Unless the table says otherwise, poses are world_from_cam in metres, of cameras 
 - Replica, rendered for NICE-SLAM: a line of ``traj.txt`` is the matrix of
   ``results/frame000000.jpg``; ``cam_params.json`` has the camera and the unit of depth maps.
 - Tanks and Temples (its tutorial): ``*.log`` has matrices of the photos, sorted by name.
+- 7-Scenes (its README): ``frame-000000.pose.txt`` of ``frame-000000.color.png``;
+  ``frame-000000.depth.png`` is in millimetres.
 - 3d Scanner App: ``frame_00000.json`` has K and a matrix of ARKit, by rows, of a camera with y up
   that looks along −z; ``depth_00000.png`` is in millimetres, ``conf_00000.png`` 0 where it is low.
 
@@ -268,6 +270,12 @@ def _log(path: Path, photos: PhotoFolder) -> Iterator[Frame]:
         yield Frame(file, " ".join(lines[5 * index + 1 : 5 * index + 5]))
 
 
+def _seven_scenes(path: Path, photos: PhotoFolder) -> Iterator[Frame]:
+    for file in sorted(path.parent.glob("*.pose.txt")):
+        stem = file.name.removesuffix(".pose.txt")
+        yield Frame(f"{stem}.color", file, file.with_name(f"{stem}.depth.png"))
+
+
 def _scanner(path: Path, photos: PhotoFolder) -> Iterator[Frame]:
     for file in sorted(path.parent.glob("frame_*.json")):
         depth, confidence = (
@@ -301,6 +309,7 @@ LAYOUTS = (
     Layout("TUM", "groundtruth.txt", "", _NUMBERS, _tum, _tum_lens, lambda path: 1 / 5000),
     Layout("Replica", "traj*.txt", "", _NUMBERS, _replica, _replica_lens, _replica_unit),
     Layout("Tanks and Temples", "*.log", "", _NUMBERS, _log, _lens_beside, metric=False),
+    Layout("7-Scenes", "*.pose.txt", "", _NUMBERS, _seven_scenes, _lens_beside, _millimetres),
     Layout(
         "3d Scanner App",
         "frame_*.json",

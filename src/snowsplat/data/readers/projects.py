@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from snowsplat.data.colmap.places import folders_below
 from snowsplat.data.readers.pose_matrices import without_camera
 from snowsplat.util.messages import Message
 
@@ -25,17 +26,30 @@ _PROJECTS = {
     ".p4d": ("a project of Pix4D", "export an undistorted COLMAP model"),
     ".r3d": ("a packed recording of Record3D", "unpack it as a zip archive"),
     ".nvm": ("a file of VisualSFM", "export bundle.out and list.txt"),
+    ".mvs": ("a scene of OpenMVS", "convert it: InterfaceCOLMAP -i scene.mvs -o model"),
+    "calibrated_camera_parameters.txt": ("a file of Pix4D", "export an undistorted COLMAP model"),
+    "sensors/trajectories.txt": ("a file of kapture", "convert it: kapture_export_colmap.py"),
+    "cameras.bin": ("a part of a COLMAP model", "put its images.bin and points3D.bin beside it"),
 }
+# Folders in which such files are searched: kapture/mapping/sensors.
+_DEEPEST = 3
 
 
-def advice(folder: Path) -> str | Message | None:
-    """What the first such file in a folder is and what to do, as the end of a message; or None."""
-    try:
-        names = sorted(path.name for path in folder.iterdir())
-    except OSError:
-        return None
-    for ending, (kind, action) in _PROJECTS.items():
-        for name in names:
-            if name.lower().endswith(ending):
-                return f"{name} is {kind}; {action}"
-    return without_camera(folder)
+def advice(path: Path) -> str | Message | None:
+    """What a file, or the first such file in a folder or below, is and what to do, as the end of a
+    message; or None."""
+    folders = [path] if path.is_file() else list(folders_below(path, _DEEPEST))
+    for folder in folders:
+        try:
+            names = [path.name] if path.is_file() else sorted(p.name for p in folder.iterdir())
+        except OSError:
+            continue
+        for ending, (kind, action) in _PROJECTS.items():
+            for name in names:
+                here = f"{folder.name}/{name}".lower().endswith(ending)
+                if here and "images.bin" not in names:  # a whole COLMAP model
+                    name = (folder / name).relative_to(path).as_posix() if path.is_dir() else name
+                    return f"{name} is {kind}; {action}"
+        if (unread := without_camera(folder)) is not None:
+            return unread
+    return None

@@ -35,6 +35,9 @@ def lens_of(where: str, values: Mapping[str, Any], image: Path) -> Lens:
 
     Raises: UserError: the model or the focal length is not known, or a value is not plausible.
     """
+    if values.get("fl_x") is None and values.get("K") is not None:
+        k = parse.numbers(f"{where}: K", values["K"], 3, 3)
+        values = {**values, "fl_x": k[0, 0], "fl_y": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]}
     width, height = stated(where, values, "w"), stated(where, values, "h")
     if width is None or height is None:
         header = read_header(image)

@@ -211,11 +211,14 @@ def test_what_lies_beside_photos_is_told_by_name_and_content(tmp_path):
         Image.new("I;16", (40, 30), 1000 + i).save(root / f"depth{i:05}.png")
         Image.new("L", (40, 30), i).save(root / f"conf_{i:05}.png")
         photo(i).resize((8, 6)).save(root / f"thumb_{i:02}.jpg")
+    photo(5).save(root / "a.color.png")
+    Image.new("I;16", (40, 30), 1000).save(root / "a.depth.png")
     photo(7).save(root / "depth_00001.jpg")
     photo(8).save(root / "normal_00077.jpg")
     (root / "a.insp").touch()
     found = find_sources([root])
     assert [s.name for s in found.files] == [
+        "a.color.png",
         "depth_00001.jpg",
         *(f"frame_{i:05}.jpg" for i in range(3)),
         "normal_00077.jpg",

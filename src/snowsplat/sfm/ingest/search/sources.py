@@ -44,6 +44,8 @@ _KINDS = r"(?P<kind>depth|conf(?:idence)?|normal|disparity|masked|thumb(?:nail)?
 _MAP = re.compile(rf"(?P<stem>.+)[._-]{_KINDS}(?:[._-]?\d+)?\.\w+", re.I)
 _NUMBERED_MAP = re.compile(rf"(?:.*/)?{_KINDS}[._-]?(?P<number>\d+)\.\w+", re.I)
 _NUMBERED = re.compile(r".*?(?P<number>\d+)\.\w+")
+# How the photo of IMG.depth.png may end: 7-Scenes has IMG.color.png.
+_COLOURS = ("", ".color", "_color", "-color", ".rgb", "_rgb")
 _KINDS_OF_MAPS = {
     "depth": message("is a depth map of another photo"),
     "conf": message("is a confidence map of another photo"),
@@ -52,6 +54,10 @@ _KINDS_OF_MAPS = {
     "masked": message("is a changed copy of another photo"),
     "thumb": message("is a small copy of another photo"),
 }
+
+
+class NothingFoundError(UserError):
+    """Neither photos nor videos, and nothing that looks like them."""
 
 
 @dataclass(frozen=True)
@@ -318,7 +324,7 @@ def _maps_beside(root: Path, photos: Sequence[str]) -> dict[str, Message]:
     found = {}
     for photo in photos:
         match = _MAP.fullmatch(photo)
-        if match is None or match["stem"] not in stems:
+        if match is None or not {match["stem"] + end for end in _COLOURS} & stems:
             match = maps.get(photo)
             key = match and (PurePosixPath(photo).parent, int(match["number"]))
             if (
@@ -412,7 +418,9 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
             path=shown(path),
             no_video=no_video,
         )
-    raise UserError("{path}: neither a photo nor a video; use another file", path=shown(path))
+    raise NothingFoundError(
+        "{path}: neither a photo nor a video; use another file", path=shown(path)
+    )
 
 
 def _is_photo(head: bytes) -> bool:
@@ -432,7 +440,7 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
         files = files_below(path, _masks_and_outputs, broken)
         if reason := _unread_photos(files, []) or _broken_links(broken):
             return UserError("{names}: {reason}", names=names, reason=reason)
-    return UserError(
+    return NothingFoundError(
         "{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; use the folder "
         "that contains them",
         names=names,
