@@ -311,7 +311,7 @@ def test_runs_from_top_to_bottom(path, tmp_path):
 
     notebook = nbformat.read(path, as_version=4)
     folder = {"metadata": {"path": str(tmp_path)}}
-    client = NotebookClient(notebook, timeout=600, kernel_name="python3", resources=folder)
+    client = NotebookClient(notebook, timeout=600, startup_timeout=600, resources=folder)
     # The notebooks see this checkout, and leave the settings of the user alone.
     settings = {name: str(tmp_path) for name in ("IPYTHONDIR", "TMPDIR")}
     client.execute(env=os.environ | settings | {"PYTHONPATH": str(ROOT / "src")})
