@@ -27,6 +27,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate
 
 from snowsplat.data import ImageLoader, View
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.formats import mesh_files
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.scene import MeshOptions
@@ -36,7 +37,7 @@ from snowsplat.scene.orientation import scene_up
 from snowsplat.surface.colors import vertex_colors
 from snowsplat.surface.depth import DepthMap, SurfaceRenderer
 from snowsplat.surface.volume import Report, fuse_maps, occupied_blocks, zero_level
-from snowsplat.training.starts.depth_map import LONGER_SIDE, map_size
+from snowsplat.training.starts.depth_map import LONGER_SIDE
 from snowsplat.training.starts.fusion import confirmed_pixels
 from snowsplat.training.starts.photos import decoded_ahead, reduced_photo, usable_pixels
 from snowsplat.training.starts.plane_sweep import Picture, depth_ranges, swept_maps
@@ -325,7 +326,7 @@ def _pictures(views: Sequence[View], report: Report) -> list[Picture]:
     pixels = sum(view.camera.width * view.camera.height for view in views)
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     side = min(LONGER_SIDE, max(1, int(longest * min(1.0, math.sqrt(_MOST_SWEPT / pixels)))))
-    widths = [map_size(view.camera.width, view.camera.height, side)[0] for view in views]
+    widths = [scaled_size(view.camera.width, view.camera.height, side)[0] for view in views]
     found = []
     with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
         for i, view in enumerate(decoded_ahead(views, widths, loader)):

@@ -29,13 +29,14 @@ from torch.nn.functional import interpolate
 from snowsplat.data.dataset import View
 from snowsplat.data.lens.resample import nearest
 from snowsplat.data.maps.map_files import read_normal_file
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import RenderOutput
 from snowsplat.scene.surface_normals import interior_pixels, normals_of_depth, rays_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import sharded_render
-from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, map_size, photo_for_map
+from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, photo_for_map
 from snowsplat.training.starts.photos import usable_pixels
 from snowsplat.training.step.batch import BatchView
 from snowsplat.util.errors import UserError
@@ -179,7 +180,7 @@ def normal_map(view: View, images: Photos, longer_side: int = LONGER_SIDE) -> Te
         return None
     values = read_normal_file(view.normals)
     check_aspect(view.normals, values.shape, view)
-    width, height = map_size(view.camera.width, view.camera.height, longer_side)
+    width, height = scaled_size(view.camera.width, view.camera.height, longer_side)
     part = view.image.view
     if part is None:
         whole = torch.from_numpy(values).permute(2, 0, 1).nan_to_num(nan=0.0)

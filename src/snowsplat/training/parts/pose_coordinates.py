@@ -52,10 +52,7 @@ def pixel_hessian(camera: Camera, dataset: Dataset) -> Tensor:
     camera = camera.to(torch.device("cpu"))
     pose = camera.cam_from_world.double()
     points = torch.zeros(0, 3) if dataset.points is None else dataset.points.xyz.cpu()
-    pixel, depth = camera.project(points.double())
-    size = torch.tensor([camera.width, camera.height])
-    inside = (depth > 0.0) & (pixel >= 0.0).all(1) & (pixel < size).all(1)
-    seen = points[inside].double()
+    seen = points[camera.sees(points.double())[1]].double()
     if len(seen) >= _FEWEST_POINTS:
         x, y, z = transform_points(pose, seen[:: max(1, len(seen) // _POINTS)]).unbind(1)
     else:  # a grid of pixels, at the depth of the middle of the scene

@@ -14,13 +14,13 @@ from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.lens.resample import nearest
 from snowsplat.data.maps.depth_alignment import align
 from snowsplat.data.maps.map_files import DepthKind, read_depth_file, to_z
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.depth_map import (
     LONGER_SIDE,
     DepthMap,
     check_aspect,
-    map_size,
     photo_for_map,
 )
 from snowsplat.training.starts.fusion import fused_points
@@ -101,7 +101,7 @@ def aligned_depth_map(
             return None
     check_aspect(view.depth, values.shape, view)
     camera, part = view.camera, view.image.view
-    width, height = map_size(camera.width, camera.height, longer_side)
+    width, height = scaled_size(camera.width, camera.height, longer_side)
     camera = camera.scaled(width, height)
     if part is None:
         whole = torch.from_numpy(values)[None, None]

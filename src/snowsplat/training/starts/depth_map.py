@@ -10,6 +10,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.decode import LoadedImage
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import transform_points
@@ -43,12 +44,6 @@ class DepthMap:
         return transform_points(camera.world_from_cam.to(cam), cam)
 
 
-def map_size(width: int, height: int, longer_side: int = LONGER_SIDE) -> tuple[int, int]:
-    """Width and height of the depth map of a view of this size, in pixels."""
-    scale = min(1.0, longer_side / max(width, height))
-    return max(1, round(scale * width)), max(1, round(scale * height))
-
-
 def check_aspect(file: Path, shape: tuple[int, ...], view: View) -> None:
     """Raises UserError: a map of this shape, (H, W, …), is not one of the whole photo of a view."""
     part = view.image.view
@@ -68,5 +63,5 @@ def check_aspect(file: Path, shape: tuple[int, ...], view: View) -> None:
 
 def photo_for_map(view: View, images: Photos, longer_side: int = LONGER_SIDE) -> LoadedImage:
     """The photo of a view at the size of its depth map, on its device."""
-    size = map_size(view.camera.width, view.camera.height, longer_side)
+    size = scaled_size(view.camera.width, view.camera.height, longer_side)
     return reduced_photo(view, images, *size)

@@ -171,9 +171,7 @@ def depth_ranges(views: Sequence[View], points: Tensor) -> list[tuple[float, flo
 
 def _inverse_depths(camera: Camera, points: Tensor) -> tuple[float, float] | None:
     """The range of inverse depths of the visible points; None if there are too few."""
-    pixel, depth = camera.project(points)
-    inside = (pixel >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
-    inverse = 1.0 / depth[inside & (depth > 0)]
+    inverse = 1.0 / camera.depths_in_view(points)
     if len(inverse) < _FEWEST_POINTS:
         return None
     low, high = inverse.quantile(inverse.new_tensor([_OUTLIERS, 1.0 - _OUTLIERS])).tolist()

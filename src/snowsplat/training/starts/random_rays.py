@@ -40,7 +40,7 @@ def random_points(
     numbers = torch.bincount(chosen, minlength=len(views)).tolist()
     xyz, rgb = [torch.zeros(0, 3)], [torch.zeros(0, 3, dtype=torch.uint8)]
     for view, number in zip(views, numbers, strict=True):
-        camera = _reduced(view.camera)
+        camera = view.camera.reduced(_LONGER_SIDE)
         photo = reduced_photo(view, images, camera.width, camera.height).to(torch.device("cpu"))
         usable = usable_pixels(photo)
         if usable is None or not usable.any():
@@ -55,15 +55,12 @@ def random_points(
     points = Points(torch.cat(xyz), torch.cat(rgb))
     # Points that several views show come first; the others are used if there are too few.
     order = torch.randperm(len(points), generator=generator)
-    alone = _views_of(points.xyz[order], cameras) < min(2, len(views))
+    seen = torch.zeros(len(points), dtype=torch.int64)  # by this number of views
+    for camera in cameras:
+        seen += camera.sees(points.xyz[order])[1]
+    alone = seen < min(2, len(views))
     order = order[torch.argsort(alone.to(torch.uint8), stable=True)][:count]
     return Points(points.xyz[order], points.rgb[order])
-
-
-def _reduced(camera: Camera) -> Camera:
-    scale = min(1.0, _LONGER_SIDE / max(camera.width, camera.height))
-    size = (max(1, round(scale * side)) for side in (camera.width, camera.height))
-    return camera.scaled(*size)
 
 
 def _depths(camera: Camera, bounds: Tensor) -> tuple[float, float]:
@@ -83,13 +80,3 @@ def _on_rays(
     down = (y + inside[1] - camera.cy) / camera.fy * depth
     cam = torch.stack([right, down, depth], dim=1)
     return transform_points(camera.world_from_cam.to(torch.float64), cam).to(torch.float32)
-
-
-def _views_of(points: Tensor, cameras: list[Camera]) -> Tensor:
-    """(P,): the number of views whose frustum contains each point."""
-    number = torch.zeros(len(points), dtype=torch.int64)
-    for camera in cameras:
-        pixel, depth = camera.project(points)
-        size = torch.tensor([camera.width, camera.height])
-        number += (depth > 0) & ((pixel >= 0) & (pixel < size)).all(1)
-    return number

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, View
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
-from snowsplat.training.starts.depth_map import LONGER_SIDE, map_size
+from snowsplat.training.starts.depth_map import LONGER_SIDE
 from snowsplat.training.starts.photos import in_threads
 
 #: Number of source views of each depth map.
@@ -57,10 +58,10 @@ def choose_views(
 ) -> MapViews:
     """Choose the views that get a depth map: all training views, if memory permits.
 
-    ``longer_side``: see `map_size`.
+    ``longer_side``: of a map, in pixels.
     """
     cameras = [view.camera for view in dataset.train]
-    sizes = [map_size(camera.width, camera.height, longer_side) for camera in cameras]
+    sizes = [scaled_size(camera.width, camera.height, longer_side) for camera in cameras]
     pixels = sum(map(math.prod, sizes))
     limit = min(_MAX_PIXELS, images.budget_bytes // _BYTES_PER_PIXEL)
     views = dataset.train[:: math.ceil(pixels / max(limit, 1))]
@@ -72,7 +73,7 @@ def choose_views(
 
 def map_pixels(views: int, width: int, height: int, longer_side: int = LONGER_SIDE) -> int:
     """About the number of pixels of all depth maps for this number of views of this size."""
-    return min(_MAX_PIXELS, views * math.prod(map_size(width, height, longer_side)))
+    return min(_MAX_PIXELS, views * math.prod(scaled_size(width, height, longer_side)))
 
 
 def _points(dataset: Dataset, generator: torch.Generator) -> Tensor:
@@ -100,9 +101,8 @@ def source_views(cameras: Sequence[Camera], points: Tensor, count: int) -> list[
     points = points.to(torch.float64)
     visible, depths, rays = [], [], []
     for camera in cameras:
-        pixel, depth = camera.project(points)
-        inside = (pixel >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
-        visible.append(inside & (depth > 0))
+        depth, inside = camera.sees(points)
+        visible.append(inside)
         depths.append(depth.clamp(min=1e-12))
         rays.append(torch.nn.functional.normalize(points - camera.position.to(points), dim=1))
     visible_, depth_, ray_ = torch.stack(visible), torch.stack(depths), torch.stack(rays)
