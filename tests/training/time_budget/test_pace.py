@@ -21,6 +21,7 @@ class Machine:
         self.downscales: list[int] = []
         self.shares: list[float] = []
         self.lengths: list[int] = []
+        self.ends: list[float] = []  # as told after each step
 
     def train(self, seconds: float, iterations: int, time_ratio: float = 1.0) -> float:
         """Returns the time of the last step, as a fraction of the budget."""
@@ -40,6 +41,7 @@ class Machine:
             if length is not None:
                 schedule.stretch(step, length)
                 self.lengths.append(length)
+            self.ends.append(self.now + pace.seconds_left)
         self.iterations = schedule.iterations
         self.gaussians = gaussians
         return (self.now - start) / seconds
@@ -150,6 +152,8 @@ def test_without_time_the_schedule_is_completed_in_few_steps():
     machine.train(0.01, 3000)
     assert machine.shares[-1] == 1.0
     assert machine.iterations == FEWEST_STEPS
+    told = [end - 100.0 for end in machine.ends[25:]]  # the first estimate is after 0.1 s
+    assert told == pytest.approx([machine.now - 100.0] * len(told), rel=0.3)
 
 
 def test_a_future_stage_is_predicted_with_the_present_slowness():

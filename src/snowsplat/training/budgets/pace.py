@@ -85,7 +85,7 @@ class Pace:
         self._last_step = clock()
         self._last_estimate = self._last_step if self._limited else -math.inf
         self._gaussians, self._growth = 0, GROWTH  # in the last step; by the last densification
-        self.end = self._last_step + (seconds or 0.0)
+        self.end = self._finish = self._last_step + (seconds or 0.0)
 
     def after_step(
         self, schedule: Schedule, step: int, downscale: int, gaussians: int
@@ -115,15 +115,18 @@ class Pace:
         after = self._work.seconds_after(self._cost.predict(1, gaussians), gaussians)
         steps = round((self.end - now - after) / mean)
         fewest = math.ceil((1.0 - schedule.share(step)) * step / _MAX_SHORTENING)
-        return step + max(steps, fewest, FEWEST_STEPS - step, 1)
+        steps = max(steps, fewest, FEWEST_STEPS - step, 1)
+        self._finish = now + mean * steps + after
+        return step + steps
 
     @property
     def seconds_left(self) -> float:
-        """The time from the last step to `end`."""
-        return max(0.0, self.end - self._last_step)
+        """The time from the last step to `end`, or longer if the budget does not suffice."""
+        return max(0.0, self.end - self._last_step, self._finish - self._last_step)
 
     def postpone(self, seconds: float) -> None:
         """The training has paused for ``seconds`` since the last step."""
         self.end += seconds
+        self._finish += seconds
         self._last_step += seconds
         self._last_estimate += seconds
