@@ -13,12 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from snowsplat.scene.geometry import (
-    invert_rigid,
-    look_at,
-    quat_from_rotation,
-    rotation_from_quat,
-)
+from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation, rotation_from_quat
 from snowsplat.synthetic.photographer import roll
 from snowsplat.trajectory.spline import Spline
 

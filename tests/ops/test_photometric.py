@@ -12,15 +12,7 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.ops.cuda import launches
 
-from .scenes import (
-    REFERENCE,
-    Variant,
-    as_float32,
-    assert_close,
-    generator,
-    one_line,
-    uniform,
-)
+from .scenes import REFERENCE, Variant, as_float32, assert_close, generator, one_line, uniform
 
 SIZES = [(1, 1), (5, 3), (3, 5), (11, 11), (17, 23), (16, 16), (33, 64), (70, 41)]
 # Near the tile sizes of a GPU: 32 columns, 24 rows of float or 12 of double.

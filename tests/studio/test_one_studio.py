@@ -6,13 +6,7 @@ import threading
 
 import pytest
 
-from snowsplat.studio.one_studio import (
-    Address,
-    Running,
-    _address_in,
-    only_studio,
-    write_address,
-)
+from snowsplat.studio.one_studio import Address, Running, _address_in, only_studio, write_address
 from snowsplat.util.run_lock import InUse
 
 

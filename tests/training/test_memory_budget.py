@@ -12,12 +12,7 @@ from snowsplat.data import Dataset, Points, View
 from snowsplat.data.photos.decode import ImageSource
 from snowsplat.data.photos.image_loader import DECODERS
 from snowsplat.scene.camera import Camera
-from snowsplat.training.budgets.memory_budget import (
-    CPU,
-    GPU,
-    _SceneCost,
-    plan_memory,
-)
+from snowsplat.training.budgets.memory_budget import CPU, GPU, _SceneCost, plan_memory
 from snowsplat.training.settings import changed
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.byte_size import format_bytes, parse_bytes

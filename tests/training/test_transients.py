@@ -21,11 +21,7 @@ from snowsplat.scene.render import render
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.parts.densification import delay_growth
-from snowsplat.training.parts.transients import (
-    MOMENTS,
-    Transients,
-    cells_that_move,
-)
+from snowsplat.training.parts.transients import MOMENTS, Transients, cells_that_move
 from snowsplat.training.parts.view_residuals import CELL, CellMap, Witnesses, cell_map, witnesses
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.starts.depth_map import DepthMap

@@ -38,12 +38,7 @@ from snowsplat.pipeline.run.results import Figures, LastPart, MakeResult
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.project.project import MAKE_RECORD, Project
-from snowsplat.project.training_folder import (
-    DATASET,
-    SCENE,
-    DatasetSettings,
-    TrainingFolder,
-)
+from snowsplat.project.training_folder import DATASET, SCENE, DatasetSettings, TrainingFolder
 from snowsplat.sfm.cost import measure_speed, survey
 from snowsplat.sfm.ingest.search.sources import Sources, find_sources
 from snowsplat.sfm.make_dataset import make_dataset

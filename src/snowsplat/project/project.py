@@ -188,11 +188,8 @@ def _training_of(scene: Path, made: dict[str, Any]) -> TrainingFolder | None:
     trained = TrainingFolder(scene.parent.parent.parent)
     if scene in map(trained.scene_path, trained.scenes()):
         return trained
-    return (
-        TrainingFolder(scene.parent / SCENE)
-        if scene == _scene_of_make(scene.parent, made)
-        else None
-    )
+    is_made = scene == _scene_of_make(scene.parent, made)
+    return TrainingFolder(scene.parent / SCENE) if is_made else None
 
 
 def _scene_of_make(folder: Path, made: dict[str, Any]) -> Path | None:

@@ -14,12 +14,7 @@ from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.routing import Route, WebSocketRoute
 
-from snowsplat.studio import (
-    library_requests,
-    picture_requests,
-    result_requests,
-    scene_requests,
-)
+from snowsplat.studio import library_requests, picture_requests, result_requests, scene_requests
 from snowsplat.studio.library import Library
 from snowsplat.studio.requests import SceneAnswer, Studio, answering
 

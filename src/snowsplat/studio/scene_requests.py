@@ -19,13 +19,7 @@ from snowsplat.studio.given_photos import leave_out
 from snowsplat.studio.hand_on import export_command, formats_of, make_command
 from snowsplat.studio.library import safe_title
 from snowsplat.studio.picture_requests import picture_of
-from snowsplat.studio.requests import (
-    SceneRoutes,
-    Studio,
-    film_has_read,
-    json_object,
-    whole_number,
-)
+from snowsplat.studio.requests import SceneRoutes, Studio, film_has_read, json_object, whole_number
 from snowsplat.studio.texts import verdict_in_languages
 from snowsplat.studio.uploads import Upload, uploads, write_part
 from snowsplat.util.errors import UserError

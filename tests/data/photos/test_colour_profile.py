@@ -10,16 +10,8 @@ from snowsplat.data.photos import colour_profile
 from snowsplat.data.photos.decode import ImageSource, load_image, load_thumbnail
 from snowsplat.sfm.ingest.photos.photo_files import decode, read_header, save
 
-from .colour_profiles import (
-    DISPLAY_P3,
-    PROPHOTO,
-    cmyk_profile,
-    grey_profile,
-    to_xyz,
-)
-from .colour_profiles import (
-    colour_profile as made,
-)
+from .colour_profiles import DISPLAY_P3, PROPHOTO, cmyk_profile, grey_profile, to_xyz
+from .colour_profiles import colour_profile as made
 
 SIZE = 48
 _SRGB = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))

@@ -15,11 +15,7 @@ from itertools import takewhile
 
 import libcst as cst
 import libcst.matchers as m
-from libcst.metadata import (
-    MetadataWrapper,
-    ParentNodeProvider,
-    PositionProvider,
-)
+from libcst.metadata import MetadataWrapper, ParentNodeProvider, PositionProvider
 from mutmut.mutation import mutators
 
 #: Nodes that are never mutated. A fault in an annotation or an import has no effect, or the file

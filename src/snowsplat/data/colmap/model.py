@@ -15,11 +15,7 @@ from torch import Tensor
 
 from snowsplat.data.colmap import binary as binary_files
 from snowsplat.data.colmap import text as text_files
-from snowsplat.data.colmap.types import (
-    ColmapImage,
-    ColmapModel,
-    PointFile,
-)
+from snowsplat.data.colmap.types import ColmapImage, ColmapModel, PointFile
 from snowsplat.data.dataset import Points, usable_points
 from snowsplat.data.lens.lens import Lens
 from snowsplat.scene.camera import Camera

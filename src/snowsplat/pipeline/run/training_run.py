@@ -27,11 +27,7 @@ from snowsplat.pipeline.run.training_files import (
 )
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import Project
-from snowsplat.project.training_folder import (
-    UNEXPLAINED,
-    DatasetSettings,
-    TrainingFolder,
-)
+from snowsplat.project.training_folder import UNEXPLAINED, DatasetSettings, TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.sfm.report.capture_verdict import recorded_verdict
 from snowsplat.training.budgets.memory_budget import MemoryPlan
@@ -121,11 +117,8 @@ class TrainingRun:
                 raise TrainingStopped(str(stopped), None) from None
         except Diverged as error:
             self.out.discard()
-            raise UserError(
-                "{error}; {last}",
-                error=error,
-                last=self._last_checkpoint_as_text(),
-            ) from None
+            last = self._last_checkpoint_as_text()
+            raise UserError("{error}; {last}", error=error, last=last) from None
         except BaseException:
             self.out.discard()
             raise

@@ -19,11 +19,7 @@ from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.ingest.content.panorama import STITCHED, is_twice_as_wide, spherical_video
 from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.ingest.photos.gather_photos import (
-    Planned,
-    plan_photos,
-    write_photos,
-)
+from snowsplat.sfm.ingest.photos.gather_photos import Planned, plan_photos, write_photos
 from snowsplat.sfm.ingest.photos.set_aside import set_fixed_parts_aside
 from snowsplat.sfm.ingest.search.sources import Source, Sources, find_sources
 from snowsplat.sfm.ingest.video.clip import Clip, max_frame_count, read_clip

@@ -17,12 +17,7 @@ from snowsplat.data.maps.map_files import DepthKind, read_depth_file, to_z
 from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
-from snowsplat.training.starts.depth_map import (
-    LONGER_SIDE,
-    DepthMap,
-    check_aspect,
-    photo_for_map,
-)
+from snowsplat.training.starts.depth_map import LONGER_SIDE, DepthMap, check_aspect, photo_for_map
 from snowsplat.training.starts.fusion import fused_points
 from snowsplat.training.starts.photos import usable_pixels
 from snowsplat.training.starts.source_views import choose_views

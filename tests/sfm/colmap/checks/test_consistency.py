@@ -8,10 +8,7 @@ import pycolmap
 import pytest
 
 from snowsplat.scene.epipolar import distances_of_matches
-from snowsplat.sfm.colmap.checks.consistency import (
-    CheckedPair,
-    agreement_of,
-)
+from snowsplat.sfm.colmap.checks.consistency import CheckedPair, agreement_of
 from snowsplat.sfm.colmap.checks.parts import find_parts
 
 
