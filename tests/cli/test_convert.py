@@ -167,15 +167,13 @@ def test_info_of_every_format(run, ply, tmp_path, format):
     np.testing.assert_allclose(bounds, [expected.amin(0), expected.amax(0)], atol=0.01)
 
 
-def test_info_reports_versions_and_rejects_other_files(run, refused, ply, tmp_path):
+def test_info_reports_versions_and_rejects_pages(run, refused, ply, tmp_path):
     assert run("convert", ply, tmp_path / "b.spz").code == 0
     assert json.loads(run("info", tmp_path / "b.spz", "--json").out)["format"] == "SPZ 3"
     assert run("convert", ply, tmp_path / "b.sog").code == 0
     assert json.loads(run("info", tmp_path / "b.sog", "--json").out)["format"] == "SOG 2"
     assert run("convert", ply, tmp_path / "b.html").code == 0
     assert "use the scene file that the page was made from" in refused("info", tmp_path / "b.html")
-    (tmp_path / "scene.obj").write_text("v 0 0 0")
-    assert "not a known scene file" in refused("info", tmp_path / "scene.obj")
 
 
 def test_the_page_of_a_training_run_starts_at_the_view_of_a_photo(run, ply, tmp_path):

@@ -207,8 +207,6 @@ def test_info(run, refused, trained, dataset, tmp_path):
     assert facts(tmp_path / "none.ply")["gaussians"] == 0
     assert "no such file" in refused("info", tmp_path / "absent.ply")
     assert "no camera poses" in refused("info", tmp_path)
-    (tmp_path / "scene.obj").write_text("v 0 0 0")
-    assert "not a known scene file" in refused("info", tmp_path / "scene.obj")
 
 
 def test_info_says_which_photos_were_left_out_and_why(run, trained, dataset, tmp_path):

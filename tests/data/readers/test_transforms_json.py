@@ -5,6 +5,7 @@ import logging
 import math
 
 import numpy as np
+import pillow_heif
 import pytest
 import torch
 from PIL import Image
@@ -154,6 +155,11 @@ def test_file_names(scene, tmp_path, spelling):
     assert view.name.endswith("a/b.png")
     assert not view.name.startswith(("/", "."))
     assert load_dataset(folder / "transforms.json", hold_out=None).train[0].name == view.name
+
+
+def test_heic_photos(scene):
+    pillow_heif.register_heif_opener()
+    assert camera_of({"fl_x": 50}, {"file_path": "a.heic"}, scene).width == 40
 
 
 def test_blender_splits(dataset_copy):

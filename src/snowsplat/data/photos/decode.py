@@ -25,13 +25,10 @@ from snowsplat.data.lens.views import LensView
 from snowsplat.data.maps.mask_pixels import mask_levels
 from snowsplat.data.photos.bit_depth import eight_bits
 from snowsplat.data.photos.colour_profile import is_transparent, to_srgb
-from snowsplat.data.photos.image_file import OPTIONAL_FORMATS, open_image, reason_of, scaled_size
+from snowsplat.data.photos.image_file import PHOTO_FORMATS, open_image, reason_of, scaled_size
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
 
-# Formats of photos (Pillow opens the MPO files of phones as JPEG). Other formats are excluded,
-# because Pillow starts external programs for some of them.
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM", *OPTIONAL_FORMATS)
 # Pixels are converted in bands of this size, to limit the memory for temporary arrays.
 _BAND_PIXELS = 1 << 20
 _EXPOSURE = Base.ExposureTime, Base.FNumber, Base.ISOSpeedRatings
@@ -381,7 +378,7 @@ def _with_alpha(planes: np.ndarray, background: Sequence[float] | None) -> np.nd
 def open_photo(path: Path, *, header_only: bool = False) -> Iterator[Image.Image]:
     """An image file. Raises UserError if it cannot be read, here or in the block."""
     try:
-        with open_image(path, _FORMATS, header_only=header_only) as image:
+        with open_image(path, PHOTO_FORMATS, header_only=header_only) as image:
             yield image
     except Exception as error:  # Pillow raises many kinds of exceptions for damaged files
         if not is_file(path):

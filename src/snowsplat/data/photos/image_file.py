@@ -20,6 +20,9 @@ logger = logging.getLogger(__name__)
 
 #: Formats that depend on how Pillow was built.
 OPTIONAL_FORMATS = ("AVIF",) if features.check("avif") else ()
+#: Formats of photos (Pillow opens the MPO files of phones as JPEG). Other formats are excluded,
+#: because Pillow starts external programs for some of them.
+PHOTO_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM", *OPTIONAL_FORMATS)
 #: The largest number of pixels of an image: Pillow's own limit. The largest camera backs have 151
 #: million. The size is known before the image is decoded. Phones take 200 million: a JPEG of up to
 #: four times as many is decoded at half its size; HEIC and AVIF, whose decoders cannot do that, are
@@ -83,6 +86,11 @@ def open_image(
         Exception: anything that Pillow raises for a damaged file.
     """
     with open(path, "rb") as file:
+        if file.read(8)[4:] == b"ftyp":
+            from pillow_heif import register_heif_opener
+
+            register_heif_opener()
+        file.seek(0)
         complete = _check_header(file)
     image: Image.Image = Image.open(path, formats=list(formats))
     try:

@@ -18,12 +18,11 @@ from PIL.ExifTags import Base
 
 from snowsplat.data.photos import image_file
 from snowsplat.data.photos.colour_profile import is_transparent, plain_pixels
-from snowsplat.data.photos.image_file import OPTIONAL_FORMATS, check_jpeg, reason_of, scaled_size
+from snowsplat.data.photos.image_file import PHOTO_FORMATS, check_jpeg, reason_of, scaled_size
 from snowsplat.sfm.ingest.content.panorama import STITCHED, Panorama, panorama_in_xmp
 from snowsplat.sfm.ingest.photos.exif import ExifInfo, exif_for_copy, read_exif
 from snowsplat.util.errors import Problem
 
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM", *OPTIONAL_FORMATS)
 # Formats that COLMAP reads, by file extension.
 _SUFFIXES = {
     "JPEG": (".jpg", ".jpeg"),
@@ -173,10 +172,7 @@ def _bits(path: Path, image: Image.Image) -> int:
 
 def open_image(path: Path, *, header_only: bool = False, page: int = 0) -> Image.Image:
     """Open a photo; its pixels are decoded later. Raises the errors of `image_file.open_image`."""
-    from pillow_heif import register_heif_opener
-
-    register_heif_opener()
-    return image_file.open_image(path, _FORMATS, header_only=header_only, page=page)
+    return image_file.open_image(path, PHOTO_FORMATS, header_only=header_only, page=page)
 
 
 def decode(path: Path, header: Header, longest: int | None, page: int = 0) -> Image.Image:
