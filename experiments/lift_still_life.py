@@ -31,12 +31,7 @@ from snowsplat.extras.lift.refine_photo import refine_photo
 from snowsplat.pipeline.output.image_files import depth_in_color, to_8bit
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import (
-    invert_rigid,
-    look_at,
-    quat_from_rotation,
-    transform_points,
-)
+from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation, transform_points
 from snowsplat.scene.render import render
 from snowsplat.synthetic.photographer import Lens, depth_map, phone_lens, photograph, walk
 from snowsplat.synthetic.scene import Scene
