@@ -161,6 +161,5 @@ def test_a_future_stage_is_predicted_with_the_present_slowness():
     cost = StepCost(work, 1.0, 5.0)
     for _ in range(3000):
         cost.observe(3.0 * work.seconds(2, 50_000), 2, 50_000)
-    assert cost.predict(2, 50_000) == pytest.approx(3.0 * work.seconds(2, 50_000), rel=0.01)
-    assert cost.predict(1, 90_000) == pytest.approx(3.0 * work.seconds(1, 90_000), rel=0.01)
-    assert cost.predict(4, 10_000) == pytest.approx(3.0 * work.seconds(4, 10_000), rel=0.01)
+    for stage in ((2, 50_000), (1, 90_000), (4, 10_000)):
+        assert cost.predict(*stage) == pytest.approx(3.0 * work.seconds(*stage), rel=0.01)

@@ -78,7 +78,7 @@ def estimates(cost, pause=0.0):
     config = recipe("classic", iterations=STEPS)
     schedule, now, gaussians = Schedule(STEPS), 100.0, 10_000
     left = Pace(Work(config, PIXELS, VIEWS), clock=lambda: now)
-    times, estimated = [], []
+    told = []
     for step in range(1, STEPS + 1):
         downscale = config.downscale_at(step, schedule)
         now += cost(downscale, gaussians, step / STEPS)
@@ -87,14 +87,9 @@ def estimates(cost, pause=0.0):
         if step == 700:
             now += pause
             left.postpone(pause)
-        times.append(now)
         left.after_step(schedule, step, downscale, gaussians)
-        estimated.append(left.seconds_left)
-    whole = times[-1] - 100.0
-    return [
-        ((time - 100.0) / whole, seconds / (times[-1] - time))
-        for time, seconds in zip(times[:-1], estimated[:-1], strict=True)
-    ]
+        told.append((now, left.seconds_left))
+    return [((at - 100.0) / (now - 100.0), seconds / (now - at)) for at, seconds in told[:-1]]
 
 
 @pytest.mark.parametrize("slowness", [0.3, 1.0, 4.0])
