@@ -67,16 +67,21 @@ def matched(tmp_path_factory) -> Dataset:
     ]
     views = []
     for i in range(10):
-        angle = 0.25 + 0.11 * i
-        position = torch.tensor([4 * np.cos(angle), 4 * np.sin(angle), 1.6 + 0.6 * np.sin(2.0 * i)])
-        pose = look_at(
-            position, torch.tensor([0.6, 0.6, 0.6]).double(), torch.tensor([0.0, 0.0, 1.0]).double()
-        )
-        camera = Camera(320, 240, 300.0, 300.0, 160.0, 120.0, pose[:3].double())
+        camera = camera_at(i)
         path = folder / f"{i:02d}.png"
         Image.fromarray(corner(camera, textures)).save(path)
         views.append(View(path.name, camera, ImageSource(path, 320, 240)))
     return Dataset(views, [], None, 4.0, "corner")
+
+
+def camera_at(i: int, step: float = 0.0) -> Camera:
+    """The camera of the view ``i``, moved by ``step`` radians along the arc."""
+    angle = 0.25 + 0.11 * i + step
+    position = torch.tensor([4 * np.cos(angle), 4 * np.sin(angle), 1.6 + 0.6 * np.sin(2.0 * i)])
+    pose = look_at(
+        position, torch.tensor([0.6, 0.6, 0.6]).double(), torch.tensor([0.0, 0.0, 1.0]).double()
+    )
+    return Camera(320, 240, 300.0, 300.0, 160.0, 120.0, pose[:3].double())
 
 
 def corner(camera: Camera, textures: list[np.ndarray]) -> np.ndarray:
@@ -253,6 +258,19 @@ def test_poses_of_some_photos(matched: Dataset) -> None:
     (finding,) = judge(dataclasses.replace(many, origin=(1e6, 0.0, 0.0)))
     assert finding.impossible
     assert "lost digits" in str(finding.text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moved", [(2, 7), (1, 4, 7)])
+def test_poses_that_are_off_by_little(matched: Dataset, moved: tuple[int, ...]) -> None:
+    """Their matches are a few pixels away from where the poses say: several times as far as those
+    of the others, which must not make it usual."""
+    views = [*matched.train]
+    for i in moved:
+        views[i] = dataclasses.replace(views[i], camera=camera_at(i, 0.06))
+    (finding,) = judge(dataclasses.replace(matched, train=views))
+    assert finding.photos == tuple(views[i].name for i in moved)
+    assert not finding.impossible
 
 
 @pytest.mark.slow

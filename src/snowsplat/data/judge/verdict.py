@@ -176,7 +176,8 @@ class _Evidence:
         names: of the views.
         rig: their cameras.
         spread: some of the views, by their indices, whose colours are compared.
-        matches, fit, wrong: of all pairs; the views whose own matches contradict their poses.
+        matches, fit: of all pairs, or of those of the right views, if most are right.
+        wrong: the views whose own matches contradict their poses.
         odds: nats, the evidence of a few pairs that are spread over the dataset.
         colours, agreement: of the spread views; None if points say nothing.
         far: the scene was far from the origin, where numbers lose digits.
@@ -213,6 +214,8 @@ class _Evidence:
         odds = matches.fit(rig, matches.spread).odds()
         names = [views[i].name for i in sample.views]
         wrong = fit.wrong(len(sample))
+        if wrong and len(wrong) <= _MINORITY * len(sample):
+            fit = matches.fit(rig, matches.without(wrong))
         return cls(names, rig, sample.spread, matches, fit, wrong, odds, colours, agreement, far)
 
     @property
@@ -231,8 +234,8 @@ class _Evidence:
         """The repairs of poses and lenses that make the matches more probable, by odds that are
         told; the most probable ones, which are equal."""
         # Single frames with wrong poses are no mistake of all.
-        wrong = set(self.wrong) if self.minority else set()
-        pairs = [pair for pair in self.matches.spread if wrong.isdisjoint((pair.a, pair.b))]
+        wrong = self.wrong if self.minority else []
+        pairs = self.matches.without(wrong, self.matches.spread)
         given = self.matches.fit(self.rig, pairs)
         found = []
         for repair in pose_repairs(self.rig):
