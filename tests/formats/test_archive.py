@@ -98,7 +98,7 @@ def test_a_project_places_its_visible_splats(tmp_path, ply, caplog):
 @pytest.mark.parametrize(
     "change",
     [{"scale": [1, 2, 1]}, {"scale": []}, {"scale": [-1] * 3}, {"rotation": [0] * 4},
-     {"rotation": "x"}, {"position": [1e999, 0, 0]}, {"position": None}],
+     {"rotation": "x"}, {"position": [1e999, 0, 0]}, {"position": None}, {"scale": [1e308]}],
 )  # fmt: skip
 def test_invalid_places_are_reported(tmp_path, ply, one_line, change):
     own = {"position": [0, 0, 0], "rotation": [0, 0, 1, 0], "scale": [1, 1, 1], **change}

@@ -9,6 +9,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.origin import HERE, add_origins, origin_of, stored_origin
+from snowsplat.util.errors import UserError
 
 POINTS = np.random.default_rng(0).normal(size=(1000, 3))
 UTM = (500_000.0, 5_400_000.0, 300.0)
@@ -76,3 +77,9 @@ def test_stored_values_are_checked():
     for value in (None, [1, 2], [1, 2, float("nan")], [1, 2, True], [1, 2, 1e300], "123"):
         assert stored_origin(value) is None
     assert add_origins(UTM, (1.0, 0.0, -300.0)) == (500_001.0, 5_400_000.0, 0.0)
+
+
+@pytest.mark.parametrize(("scale", "size"), [(1e300, "large"), (1e-300, "small")])
+def test_a_scale_that_float32_cannot_represent_is_refused(scale, size):
+    with pytest.raises(UserError, match=size):
+        edit.transform_world(scene(), Similarity(scale, torch.eye(3), torch.zeros(3)))

@@ -24,6 +24,7 @@ from snowsplat.formats.ply import is_ply, is_scene, read_ply
 from snowsplat.formats.sog import read_sog
 from snowsplat.formats.sog_container import meta_folder
 from snowsplat.formats.zip_members import ZipMembers
+from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.util.ply import open_table
 from snowsplat.util.safe_json import parse_json, quoted
@@ -191,4 +192,8 @@ def _place(scene: GaussianArrays, settings: dict[str, Any]) -> GaussianArrays:
     if scale[0] == 1 and not offset.any() and np.allclose(rotation, np.eye(3), atol=1e-6):
         return scene
     similarity = Similarity(scale[0], torch.from_numpy(rotation), torch.from_numpy(offset))
-    return GaussianArrays.from_gaussians(transform_world(scene.to_gaussians(), similarity))
+    try:
+        placed = transform_world(scene.to_gaussians(), similarity)
+    except UserError:  # larger than float32 can represent
+        raise Damaged("its {document} has no valid positions", document=_DOCUMENT) from None
+    return GaussianArrays.from_gaussians(placed)

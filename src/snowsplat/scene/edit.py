@@ -14,6 +14,8 @@ from snowsplat.ops import reference
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.scene.geometry import Similarity, quat_from_rotation, quat_product
 from snowsplat.scene.origin import HERE, Origin, origin_of
+from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 logger = logging.getLogger(__name__)
 
@@ -47,11 +49,20 @@ def transform_world(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
     """`transform` for positions in the world, which are the means plus the origin of the scene.
 
     They are computed in float64; the result has an origin if float32 would lose precision.
+    Raises: UserError: the result would be larger or smaller than float32 can represent.
     """
     world = similarity.apply(_world(gaussians))
     size = float(gaussians.log_scales.median().exp()) * similarity.scale if len(world) else 0.0
     origin = origin_of(world.numpy(), size)
     means = (world - torch.tensor(origin, dtype=torch.float64)).to(gaussians.means.dtype)
+    before, after = (m[gaussians.means.isfinite().all(1)] for m in (gaussians.means, means))
+    shrunk = bool((before != before[:1]).any()) and not (after != after[:1]).any()
+    if shrunk or not after.isfinite().all():
+        raise UserError(
+            "a scale of {scale:.3g} makes the scene too {size} for float32; use another one",
+            scale=similarity.scale,
+            size=message("small") if shrunk else message("large"),
+        )
     return replace(transform(gaussians, similarity), means=means, origin=origin)
 
 
