@@ -90,6 +90,8 @@ def open_image(
             from pillow_heif import register_heif_opener
 
             register_heif_opener()
+        else:  # Pillow may not know HEIF yet
+            formats = [name for name in formats if name != "HEIF"]
         file.seek(0)
         complete = _check_header(file)
     image: Image.Image = Image.open(path, formats=list(formats))
