@@ -64,8 +64,7 @@ class Demo(Command):
         _print_errors(result.errors)
         if not result.accurate:
             wrong = message(
-                "snowsplat: the camera poses are wrong; repeat the demo in a new folder while no "
-                "other programs run"
+                "snowsplat: the camera poses are wrong; repeat the demo in a new folder"
             )
             print(wrong, file=sys.stderr)
             return Exit(1)

@@ -27,7 +27,6 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate
 
 from snowsplat.data import ImageLoader, View
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.formats import mesh_files
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.scene import MeshOptions
@@ -44,6 +43,7 @@ from snowsplat.training.starts.plane_sweep import Picture, depth_ranges, swept_m
 from snowsplat.training.starts.source_views import source_views
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import check_target, make_parent
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.machine import return_unused
 from snowsplat.util.process import single_threaded
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from snowsplat.scene.geometry import Similarity, invert_rigid, transform_points
 from snowsplat.scene.origin import Origin
+from snowsplat.util.image_size import scaled_size
 
 #: The near plane of the implementation of the paper, in world units.
 NEAR = 0.2
@@ -92,8 +93,7 @@ class Camera:
 
     def reduced(self, longest: int) -> Camera:
         """The same view in an image whose longer side has at most ``longest`` pixels."""
-        scale = min(1.0, longest / max(self.width, self.height))
-        return self.scaled(max(1, round(scale * self.width)), max(1, round(scale * self.height)))
+        return self.scaled(*scaled_size(self.width, self.height, longest))
 
     def to(self, device: torch.device) -> Camera:
         """This camera with its pose on ``device``, as rendering on that device needs it."""

@@ -12,10 +12,10 @@ from snowsplat.data.judge.lens_check import Finding
 from snowsplat.data.judge.rig import Rig
 from snowsplat.data.maps.mask_pixels import INVERT, doubt_about_masks, look_of
 from snowsplat.data.photos.decode import ImageSource, load_mask
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import each_photo
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.messages import message
 
 # Masks that are decoded, spread over the dataset, and the longer side of their small copies.

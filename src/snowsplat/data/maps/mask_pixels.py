@@ -14,7 +14,8 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.photos.colour_profile import is_transparent
-from snowsplat.data.photos.image_file import open_image, scaled_size
+from snowsplat.data.photos.image_file import open_image
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.messages import Message, message
 
 # The share of a typical photo below which hardly anything is used.

@@ -25,8 +25,9 @@ from snowsplat.data.lens.views import LensView
 from snowsplat.data.maps.mask_pixels import mask_levels
 from snowsplat.data.photos.bit_depth import eight_bits
 from snowsplat.data.photos.colour_profile import is_transparent, to_srgb
-from snowsplat.data.photos.image_file import PHOTO_FORMATS, open_image, reason_of, scaled_size
+from snowsplat.data.photos.image_file import PHOTO_FORMATS, open_image, reason_of
 from snowsplat.util.errors import UserError
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.safe_json import is_file
 
 # Pixels are converted in bands of this size, to limit the memory for temporary arrays.

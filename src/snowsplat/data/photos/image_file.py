@@ -142,14 +142,6 @@ def reason_of(error: Exception) -> Message:
     return Message(" ".join(str(error).split())[:120] or type(error).__name__)
 
 
-def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
-    """The size with its longest side at most ``longest``; never enlarged."""
-    if longest is None or max(width, height) <= longest:
-        return width, height
-    scale = longest / max(width, height)
-    return max(1, round(width * scale)), max(1, round(height * scale))
-
-
 def _check_header(file: BinaryIO) -> bool:
     """Whether the file ends as its format requires; True if that is not known."""
     if file.read(len(GIT_LFS)) == GIT_LFS:

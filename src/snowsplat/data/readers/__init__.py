@@ -27,7 +27,7 @@ from snowsplat.data.readers import (
     record3d,
     transforms_json,
 )
-from snowsplat.data.readers.projects import advice
+from snowsplat.data.readers.projects import DEEPEST, advice
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reader, Reconstruction
 from snowsplat.util.errors import UserError
 
@@ -47,8 +47,6 @@ PROGRAMS = (
 )
 #: All readers; the first one that finds its files in a folder is used.
 READERS = (colmap.READER, transforms_json.READER, *PROGRAMS)
-# Where the export of a program is searched: MeshroomCache/StructureFromMotion/UID.
-_DEEPEST = 3
 
 
 class NoPosesError(UserError):
@@ -77,7 +75,7 @@ def find_poses(root: Path, images: str = "images", *, deep: bool = True) -> Pose
     for reader in (*PROGRAMS, transforms_json.READER) if root.is_file() else READERS:
         if files := reader.find(root, images, deep):
             return Poses(reader, files)
-    below = islice(folders_below(root, _DEEPEST), 1, None) if deep and root.is_dir() else ()
+    below = islice(folders_below(root, DEEPEST), 1, None) if deep and root.is_dir() else ()
     found = [
         Poses(reader, files)
         for folder in below

@@ -31,14 +31,15 @@ _PROJECTS = {
     "sensors/trajectories.txt": ("a file of kapture", "convert it: kapture_export_colmap.py"),
     "cameras.bin": ("a part of a COLMAP model", "put its images.bin and points3D.bin beside it"),
 }
-# Folders in which such files are searched: kapture/mapping/sensors.
-_DEEPEST = 3
+#: How deep in a dataset such files, and exports, are searched: kapture/mapping/sensors,
+#: MeshroomCache/StructureFromMotion/UID.
+DEEPEST = 3
 
 
 def advice(path: Path) -> str | Message | None:
     """What a file, or the first such file in a folder or below, is and what to do, as the end of a
     message; or None."""
-    folders = [path] if path.is_file() else list(folders_below(path, _DEEPEST))
+    folders = [path] if path.is_file() else list(folders_below(path, DEEPEST))
     for folder in folders:
         try:
             names = [path.name] if path.is_file() else sorted(p.name for p in folder.iterdir())

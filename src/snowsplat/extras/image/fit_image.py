@@ -16,7 +16,6 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.photos.decode import ImageSource, load_image, read_header
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.evaluation.metrics import compare
 from snowsplat.extras.image.compact_file import read_compact, write_compact, write_svg
 from snowsplat.extras.image.fit import COLORS, LOG_SIGMAS, OPACITY_LOGIT, Fitter, ImageGaussians
@@ -31,6 +30,7 @@ from snowsplat.util import charts
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import check_output, new_entries, write_json, write_text
 from snowsplat.util.html import picture, render_page
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.machine import processor_name, system_name
 from snowsplat.util.messages import Message, message
 from snowsplat.util.process import single_threaded

@@ -29,7 +29,6 @@ from torch.nn.functional import interpolate
 from snowsplat.data.dataset import View
 from snowsplat.data.lens.resample import nearest
 from snowsplat.data.maps.map_files import read_normal_file
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import RenderOutput
@@ -40,6 +39,7 @@ from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, photo
 from snowsplat.training.starts.photos import usable_pixels
 from snowsplat.training.step.batch import BatchView
 from snowsplat.util.errors import UserError
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.messages import message
 from snowsplat.util.names import first_names
 

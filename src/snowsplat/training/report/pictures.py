@@ -10,10 +10,10 @@ import torch
 from PIL import Image
 
 from snowsplat.data import ImageLoader, View
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.evaluation.metrics import Evaluation, Rendering, ViewMetrics, renderings
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import in_colors, to_8bit
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.messages import Message, message
 
 #: Number of views that are shown, of those with the lowest and the highest PSNR.

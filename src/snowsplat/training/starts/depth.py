@@ -14,7 +14,6 @@ from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.lens.resample import nearest
 from snowsplat.data.maps.depth_alignment import align
 from snowsplat.data.maps.map_files import DepthKind, read_depth_file, to_z
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.depth_map import LONGER_SIDE, DepthMap, check_aspect, photo_for_map
@@ -22,6 +21,7 @@ from snowsplat.training.starts.fusion import fused_points
 from snowsplat.training.starts.photos import usable_pixels
 from snowsplat.training.starts.source_views import choose_views
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.image_size import scaled_size
 
 logger = logging.getLogger(__name__)
 

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.decode import LoadedImage
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import transform_points
 from snowsplat.training.starts.photos import reduced_photo
 from snowsplat.util.errors import UserError
+from snowsplat.util.image_size import scaled_size
 
 #: Photos are reduced so that their longer side has at most this number of pixels.
 LONGER_SIDE = 640

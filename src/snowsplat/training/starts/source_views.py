@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, View
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.depth_map import LONGER_SIDE
 from snowsplat.training.starts.photos import in_threads
+from snowsplat.util.image_size import scaled_size
 
 #: Number of source views of each depth map.
 _SOURCES = 4

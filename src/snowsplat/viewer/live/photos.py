@@ -18,9 +18,9 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.data import View
 from snowsplat.data.photos.decode import load_image
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.errors import UserError
+from snowsplat.util.image_size import scaled_size
 from snowsplat.viewer.live.pictures import Photo, PhotoRectangle
 from snowsplat.viewer.live.session import PhotoView, Session
 

@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.scene.camera import Camera
+from snowsplat.util.image_size import scaled_size
 from snowsplat.viewer.live.pictures import Display, View
 
 STILL = 0.2  # seconds without motion after which a camera counts as still

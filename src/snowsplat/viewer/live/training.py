@@ -14,11 +14,11 @@ from torch import Tensor
 
 from snowsplat.data import View
 from snowsplat.data.photos.decode import load_image, load_mask, resize_area
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.interrupts import raise_deferred_interrupt
 from snowsplat.util.messages import Message
 from snowsplat.util.process import single_threaded

@@ -6,7 +6,6 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.sfm.ingest.photos.photo_files import (
     Unusable,
     decode,
@@ -15,6 +14,7 @@ from snowsplat.sfm.ingest.photos.photo_files import (
     read_header,
     save,
 )
+from snowsplat.util.image_size import scaled_size
 
 from ...pictures import HEIGHT, WIDTH, exif, photo, wall
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.sfm.ingest.photos.photo_files import open_image
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.machine import memory_bytes
 from snowsplat.util.native_library import call_with_arrays, check_array
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.photos.image_file import scaled_size
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.messages import Message, message
 
 #: Longest side in pixels of the copies that are compared for sharpness. A blur of half a pixel of

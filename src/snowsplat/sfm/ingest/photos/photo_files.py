@@ -18,10 +18,11 @@ from PIL.ExifTags import Base
 
 from snowsplat.data.photos import image_file
 from snowsplat.data.photos.colour_profile import is_transparent, plain_pixels
-from snowsplat.data.photos.image_file import PHOTO_FORMATS, check_jpeg, reason_of, scaled_size
+from snowsplat.data.photos.image_file import PHOTO_FORMATS, check_jpeg, reason_of
 from snowsplat.sfm.ingest.content.panorama import STITCHED, Panorama, panorama_in_xmp
 from snowsplat.sfm.ingest.photos.exif import ExifInfo, exif_for_copy, read_exif
 from snowsplat.util.errors import Problem
+from snowsplat.util.image_size import scaled_size
 
 # Formats that COLMAP reads, by file extension.
 _SUFFIXES = {

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.data.photos.tone_mapping import HLG, PQ, map_tones
 from snowsplat.sfm.ingest.content.fixed_parts import (
     ENOUGH_PHOTOS,
@@ -51,6 +50,7 @@ from snowsplat.sfm.ingest.video.key_frames import Candidate, choose
 from snowsplat.sfm.ingest.video.motion import FrameMotion, has_moved
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import shown
+from snowsplat.util.image_size import scaled_size
 from snowsplat.util.messages import Message, message
 
 if TYPE_CHECKING:
