@@ -258,10 +258,11 @@ def test_a_thousand_connections(server):
             with contextlib.suppress(OSError):
                 client.sendall(b"GET / HT" if i % 2 else b"")
             strangers.append(client)
-        most = guard.CONNECTIONS
-        assert threading.active_count() - threads <= most + 20
-        own = len(os.listdir("/proc/self/fd")) - descriptors - len(strangers)
-        assert own <= most + 20
+        most = guard.CONNECTIONS + 20
+        assert threading.active_count() - threads <= most
+        # A connection beyond the limit has a descriptor until the server comes to it.
+        own = descriptors + len(strangers)
+        wait_until(lambda: len(os.listdir("/proc/self/fd")) - own <= most)
         known.request("GET", path)
         assert known.getresponse().read() == b"<!doctype html>"
     finally:
