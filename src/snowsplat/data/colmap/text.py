@@ -239,7 +239,7 @@ def _pairs(track: str) -> np.ndarray:
     """(N, 2) int64; none of a track that is damaged, because no point needs its track."""
     try:
         return np.array(track.split(), np.int64).reshape(-1, 2)
-    except ValueError:
+    except (ValueError, OverflowError):
         return np.empty((0, 2), np.int64)
 
 
