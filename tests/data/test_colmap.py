@@ -243,6 +243,14 @@ def test_colours_of_points_in_text_files(dataset_copy, colour, valid):
             read_points(folder / "sparse/0")
 
 
+@pytest.mark.parametrize("name", ["cameras.txt", "images.txt"])
+def test_damaged_utf16(dataset_copy, name):
+    folder = dataset_copy("colmap-txt")
+    (folder / "sparse/0" / name).write_bytes(b"\xfe\xff\x00")
+    with pytest.raises(UserError, match=name):
+        load_dataset(folder)
+
+
 @pytest.mark.parametrize("track", ["1", "1 x", "1 " + "9" * 30])
 def test_a_point_without_its_damaged_track(tmp_path, track):
     (tmp_path / "points3D.txt").write_text(f"1 0.5 1.5 2.5 0 0 0 0 {track}\n")

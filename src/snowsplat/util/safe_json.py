@@ -53,6 +53,12 @@ def encoding_of(data: bytes) -> str:
     return "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
 
 
+def lenient(encoding: str) -> tuple[str, str]:
+    """Encoding and handling of errors, for names of files: bytes that are not UTF-8 stay as they
+    are. UTF-16 has no such bytes."""
+    return encoding, "replace" if encoding == "utf-16" else "surrogateescape"
+
+
 def parse_json(data: bytes, ratio: int = _RATIO) -> Any:
     """The value of a JSON text; see `encoding_of`.
 

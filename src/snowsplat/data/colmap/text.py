@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.models import COLMAP_MODELS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import reading, shown
-from snowsplat.util.safe_json import encoding_of
+from snowsplat.util.safe_json import encoding_of, lenient
 
 logger = logging.getLogger(__name__)
 
@@ -44,15 +45,16 @@ _LONGEST_TRACK = 1 << 16
 
 def _lines(path: Path) -> Iterator[str]:
     """The lines of a text file, without comments."""
-    with reading(path), open(path, encoding=_encoding(path), errors="surrogateescape") as file:
+    with reading(path), _open(path) as file:
         for line in file:
             if not line.startswith("#"):
                 yield line.strip()
 
 
-def _encoding(path: Path) -> str:
+def _open(path: Path) -> TextIO:
     with open(path, "rb") as file:
-        return encoding_of(file.read(2))
+        encoding, errors = lenient(encoding_of(file.read(2)))
+    return open(path, encoding=encoding, errors=errors)
 
 
 def _count_words(line: str) -> int:
@@ -68,7 +70,7 @@ def _count_words(line: str) -> int:
 def _warn_if_fewer(path: Path, kind: str, count: int) -> None:
     # COLMAP writes the number into a comment. It may be outdated if somebody edited the file, so
     # a difference is only a warning.
-    with open(path, encoding=_encoding(path), errors="replace") as file:
+    with _open(path) as file:
         head = file.read(1000)
     declared = re.search(rf"^#.*Number of {kind}: (\d{{1,12}})\b", head, re.MULTILINE)
     if declared and int(declared[1]) > count:

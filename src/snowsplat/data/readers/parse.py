@@ -14,7 +14,7 @@ import numpy as np
 from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.files import reading
 from snowsplat.util.messages import Message
-from snowsplat.util.safe_json import encoding_of, quoted, read_json
+from snowsplat.util.safe_json import encoding_of, lenient, quoted, read_json
 
 #: Memory for JSON values per byte of the text. A point of OpenSfM needs 7 times its text.
 _JSON_RATIO = 8
@@ -57,7 +57,7 @@ def load_text(path: Path) -> str:
     Raises: UserError: the file cannot be read.
     """
     data = _load_bytes(path)
-    return data.decode(encoding_of(data), "surrogateescape")
+    return data.decode(*lenient(encoding_of(data)))
 
 
 def load_xml(path: Path) -> Element:
