@@ -19,6 +19,9 @@ import pytest
 # that send it need it to work, here and in the processes that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# It protects files from a loss of power only, and a disk may take 20 ms for each of them.
+os.fsync = lambda handle: None
+
 if "PYTEST_XDIST_WORKER" in os.environ:
     # There is one process per core. Torch's threads spin while they wait, so several threads per
     # process would compete for the cores. The variable is set before torch is imported. Results
