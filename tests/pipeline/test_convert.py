@@ -136,13 +136,19 @@ def test_cameras_of_a_file_may_be_in_the_world(tmp_path):
         assert float(a.position.norm()) < 10
 
 
-def test_the_photos_improve_a_decimated_scene(dataset, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def out(dataset, tmp_path_factory):
+    out = tmp_path_factory.mktemp("trained") / "out"
+    train(dataset, out, TrainOptions(settings={"iterations": 60}))
+    return out
+
+
+def test_the_photos_improve_a_decimated_scene(dataset, out, tmp_path, monkeypatch):
     monkeypatch.setattr("snowsplat.pipeline.convert._REFINED_STEPS", 40)
-    train(dataset, tmp_path / "out", TrainOptions(settings={"iterations": 60}))
-    count = len(read_gaussians(tmp_path / "out/point_cloud/iteration_60/point_cloud.ply")) // 3
+    count = len(read_gaussians(out / "point_cloud/iteration_60/point_cloud.ply")) // 3
     plain, refined = tmp_path / "plain.ply", tmp_path / "refined.ply"
-    convert(tmp_path / "out", plain, Edits(decimate=count))
-    convert(tmp_path / "out", refined, Edits(decimate=count), dataset=dataset)
+    convert(out, plain, Edits(decimate=count))
+    convert(out, refined, Edits(decimate=count), dataset=dataset)
     views = load_dataset(dataset, hold_out=None).train
     before, after = (evaluate_views(read_gaussians(path), views).psnr for path in (plain, refined))
     assert after > before + 1.0
@@ -151,18 +157,13 @@ def test_the_photos_improve_a_decimated_scene(dataset, tmp_path, monkeypatch):
 
 def test_edits_that_hide_a_part_are_refused(dataset, tmp_path):
     (tmp_path / "a.ply").touch()
-    for edits in (
-        Edits(),
-        Edits(decimate=9, crop=(0, 0, 0, 1, 1, 1)),
-    ):
+    for edits in (Edits(), Edits(decimate=9, crop=(0, 0, 0, 1, 1, 1))):
         with pytest.raises(SettingError) as error:
             convert(tmp_path / "a.ply", tmp_path / "b.ply", edits, dataset=dataset)
         assert error.value.setting == "refine"
 
 
-def test_the_cameras_of_an_output_folder_are_used(dataset, tmp_path):
-    out = tmp_path / "out"
-    train(dataset, out, TrainOptions(settings={"iterations": 60}))
+def test_the_cameras_of_an_output_folder_are_used(out, tmp_path):
     file = out / "point_cloud/iteration_60/point_cloud.ply"
     whole, bare = read_gaussians(file), tmp_path / "bare.ply"
     shutil.copy(file, bare)
