@@ -35,11 +35,12 @@ class Walk(walks.Walk):
     seen: list[np.ndarray]  # for each camera, the points of its features
 
 
-def walk() -> Walk:
+def walk(points: int = 4000) -> Walk:
+    """With fewer points, the mapper may confuse the two groups, too."""
     random = np.random.default_rng(0)
     low, high = [-7, -2.5, 4], [STEP * COUNT + 6, 2.5, 8]
     twin = random.uniform([1, -2.5, 4], [5, 2.5, 8], (TWINS, 3))
-    xyz = np.concatenate([twin, twin + SHIFT, random.uniform(low, high, (4000, 3))])
+    xyz = np.concatenate([twin, twin + SHIFT, random.uniform(low, high, (points, 3))])
     count = np.arange(COUNT)
     centres = np.stack([STEP * count, 0.4 * np.sin(2 * count), 0.3 * np.cos(3 * count)], 1)
     twins = np.stack([np.arange(TWINS), np.arange(TWINS) + TWINS], 1)

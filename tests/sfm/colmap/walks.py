@@ -51,7 +51,7 @@ def forward(count: int = 12, step: float = 1.5) -> Walk:
     """Along a street between two rows of houses; the camera looks ahead."""
     random = np.random.default_rng(0)
     length = count * step + 40
-    total = 3000
+    total = 1500
     side = random.choice([-1, 1], total) * random.uniform(5, 7, total)
     height, along = random.uniform((-4, 0), (1.6, length), (total, 2)).T
     xyz = np.stack([side, height, along], 1)

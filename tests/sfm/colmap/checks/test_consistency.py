@@ -181,46 +181,27 @@ def test_support_of_a_pair(hits, misses, agreeing, support):
     assert pair.torn == (support < 0.3)
 
 
-@pytest.fixture
-def two_views():
-    """cam2_from_cam1, and the rays of 200 points in both cameras."""
+def test_which_matches_agree_with_their_pose():
     random = np.random.default_rng(3)
     axis = np.array([0.1, 0.25, -0.05])
     pose = pycolmap.Rigid3d(pycolmap.Rotation3d(axis), np.array([1.0, 0.2, 0.1]))
     points = random.uniform([-3, -3, 4], [3, 3, 9], (200, 3))
-    both = points, points @ pose.rotation.matrix().T + pose.translation
-    return (pose, *(xyz[:, :2] / xyz[:, 2:] for xyz in both))
+    rotation = pose.rotation.matrix()
 
+    def agreeing(pose, others, error=1e-3):
+        rays = (xyz[:, :2] / xyz[:, 2:] for xyz in (points, others))
+        distances = distances_of_matches(pose.rotation.matrix(), pose.translation, *rays)
+        return np.mean(distances <= error)
 
-def agreement(pose, rays1, rays2, error):
-    rotation, translation = pose.rotation.matrix(), pose.translation
-    return np.mean(distances_of_matches(rotation, translation, rays1, rays2) <= error)
-
-
-def test_matches_agree_with_their_pose(two_views):
-    pose, rays1, rays2 = two_views
-    assert agreement(pose, rays1, rays2, 1e-9) == 1
-
-
-def test_matches_behind_the_cameras_do_not_agree(two_views):
-    pose, rays1, rays2 = two_views
-    back = pycolmap.Rigid3d(pose.rotation, -pose.translation)
-    assert agreement(back, rays1, rays2, 1e-3) < 0.1
-
-
-def test_matches_of_a_turning_camera_agree(two_views):
-    """The rays are parallel, so there are no points."""
-    pose, rays1, _ = two_views
-    turned = np.concatenate([rays1, np.ones((200, 1))], 1) @ pose.rotation.matrix().T
-    moved = pycolmap.Rigid3d(pose.rotation, np.array([0.01, 0, 0]))
-    assert agreement(moved, rays1, turned[:, :2] / turned[:, 2:], 1e-3) == 1
-
-
-def test_matches_do_not_agree_with_another_pose(two_views):
-    pose, rays1, rays2 = two_views
+    seen = points @ rotation.T + pose.translation
+    assert agreeing(pose, seen, 1e-9) == 1
+    # Behind the cameras, and of another pose.
+    assert agreeing(pycolmap.Rigid3d(pose.rotation, -pose.translation), seen) < 0.1
     turn = pycolmap.Rotation3d(np.array([0, np.radians(20), 0]))
-    wrong = pycolmap.Rigid3d(turn * pose.rotation, pose.translation)
-    assert agreement(wrong, rays1, rays2, 1e-3) < 0.1
+    assert agreeing(pycolmap.Rigid3d(turn * pose.rotation, pose.translation), seen) < 0.1
+    # If the camera only turns, the rays are parallel, so there are no points.
+    moved = pycolmap.Rigid3d(pose.rotation, np.array([0.01, 0, 0]))
+    assert agreeing(moved, points @ rotation.T) == 1
 
 
 def test_agreement_of_a_model_is_that_of_the_worst_of_the_strongest_pairs():

@@ -68,8 +68,3 @@ def test_more_effort_is_useless_without_overlap_or_motion():
     assert not Evidence([2000] * 5, all_pairs(5), 0.1, 10).more_effort_is_useless
     assert Evidence([2000] * 5, all_pairs(5), 0.001, 10).more_effort_is_useless
     assert Evidence([2000] * 5, all_pairs(5, flat=True), 0.1, 10).more_effort_is_useless
-
-
-def test_unusable_photos_are_not_counted():
-    evidence = Evidence([2000, 2000, 2000, 10, 2000], all_pairs(3), 0.1, 10)
-    assert evidence.usable == 3

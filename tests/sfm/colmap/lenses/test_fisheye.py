@@ -113,36 +113,6 @@ def test_a_fisheye_lens_begins_with_few_parameters_and_a_prior():
         assert len(camera.extra_params_idxs()) <= 1 or not camera.has_prior_focal_length
 
 
-def camera(model, params, size=(640, 480)):
-    return pycolmap.Camera(model=model, width=size[0], height=size[1], params=params)
-
-
-@pytest.mark.parametrize(
-    ("model", "params"),
-    [
-        ("OPENCV_FISHEYE", [305.0, 305.0, 320.0, 240.0, 0.03, -0.008, 0.001, 0.0]),
-        ("SIMPLE_FISHEYE", [140.0, 320.0, 240.0]),  # an image circle of 196°
-        ("RADIAL_FISHEYE", [150.0, 320.0, 240.0, -1 / 24, 0.0]),  # equal solid angles
-        ("SIMPLE_RADIAL_FISHEYE", [500.0, 320.0, 240.0, 0.33]),  # hardly a fisheye
-    ],
-)
-def test_fisheye_lenses_of_real_cameras_are_possible(model, params):
-    assert findings_of(camera(model, params)) == []
-
-
-@pytest.mark.parametrize(
-    ("model", "params", "message"),
-    [
-        ("SIMPLE_RADIAL_FISHEYE", [305.0, 320.0, 240.0, -0.4], "not one-to-one"),
-        ("SIMPLE_FISHEYE", [90.0, 320.0, 240.0], "field of view of 306°"),
-        ("OPENCV", [402.3, 392.8, 320.0, 240.0, -0.315, 0.08, 0.0, 0.0], "as a fisheye lens does"),
-    ],
-)
-def test_a_wrong_lens_is_named(model, params, message):
-    (found,) = findings_of(camera(model, params))
-    assert message in str(found.sentence)
-
-
 def test_matches_behind_the_camera_agree_with_their_pose():
     """A fisheye lens of 190° sees points at an angle of 95°."""
     random = np.random.default_rng(0)

@@ -10,12 +10,10 @@ import pytest
 from snowsplat.sfm.colmap.database import VerifiedPair, closing_database
 from snowsplat.sfm.colmap.mapping import mapping as mapping_module
 from snowsplat.sfm.colmap.mapping.incremental import _Growth
-from snowsplat.sfm.colmap.mapping.mapping import Mapping
 from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph
-from snowsplat.sfm.progress import silent
 
 from .. import look_alikes
-from ..checks.test_repair import largest_centre_error, state_of
+from ..checks.test_repair import largest_centre_error, mapping_of, state_of
 
 pytestmark = pytest.mark.sfm
 
@@ -30,16 +28,19 @@ def scene():
 
 @pytest.fixture
 def mapping(tmp_path, scene):
-    database = look_alikes.write_database(tmp_path / "database.db", scene)
-    return Mapping(database, tmp_path, 1.0, 1, silent)
+    return mapping_of(tmp_path, scene)
 
 
-@pytest.mark.parametrize("ordered", [True, False], ids=["numbered", "unordered"])
-def test_a_walk_past_look_alikes(mapping, scene, ordered):
-    if not ordered:
-        rows = [(name, i) for i, name in enumerate(UNORDERED, start=1)]
-        with closing(sqlite3.connect(mapping.database)) as connection, connection:
-            connection.executemany("UPDATE images SET name = ? WHERE image_id = ?", rows)
+@pytest.fixture
+def quick(tmp_path):
+    """With fewer points."""
+    return mapping_of(tmp_path, look_alikes.walk(1600))
+
+
+def test_a_walk_past_look_alikes_without_an_order(mapping, scene):
+    rows = [(name, i) for i, name in enumerate(UNORDERED, start=1)]
+    with closing(sqlite3.connect(mapping.database)) as connection, connection:
+        connection.executemany("UPDATE images SET name = ? WHERE image_id = ?", rows)
     (model,) = mapping.run("incremental")
     assert set(model.reg_image_ids()) == EVERY
     assert largest_centre_error(model, scene) < 0.05
@@ -62,9 +63,9 @@ def test_a_part_of_the_photos_is_registered_first(mapping, scene, monkeypatch):
     assert largest_centre_error(model, scene) < 0.05
 
 
-def test_registration_without_bundle_adjustment_changes_no_pose(mapping):
-    graph = ViewGraph.read(mapping.database)
-    mapper = mapping._mapper(graph, relaxed=False)
+def test_registration_without_bundle_adjustment_changes_no_pose(quick):
+    graph = ViewGraph.read(quick.database)
+    mapper = quick._mapper(graph, relaxed=False)
     model = mapper.start(graph.names)
     mapper.grow(model, range(1, 9), adjust=True)
     before = {i: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()}
@@ -75,9 +76,9 @@ def test_registration_without_bundle_adjustment_changes_no_pose(mapping):
         assert np.array_equal(model.image(photo).cam_from_world().matrix(), pose)
 
 
-def test_a_model_starts_with_other_photos_each_time(mapping):
-    graph = ViewGraph.read(mapping.database)
-    mapper = mapping._mapper(graph, relaxed=False)
+def test_a_model_starts_with_other_photos_each_time(quick):
+    graph = ViewGraph.read(quick.database)
+    mapper = quick._mapper(graph, relaxed=False)
     first, second = (set(mapper.start(graph.names).reg_image_ids()) for _ in range(2))
     assert len(first) == len(second) == 2
     assert first != second
@@ -104,21 +105,23 @@ def test_the_photos_of_a_small_model_are_available_for_a_large_one(mapping, scen
     assert not starts[0] & starts[1]
 
 
-def test_photos_of_another_place_make_another_model(mapping):
-    with closing_database(mapping.database) as database:
+def test_photos_of_another_place_make_another_model(quick):
+    with closing_database(quick.database) as database:
         for i in range(1, 9):
             for j in range(9, 17):
                 if database.exists_two_view_geometry(i, j):
                     database.delete_two_view_geometry(i, j)
-    models = mapping.run("incremental")
+    models = quick.run("incremental")
     assert sorted(sorted(model.reg_image_ids()) for model in models) == [
         list(range(1, 9)),
         list(range(9, 17)),
     ]
 
 
-def test_equal_runs_give_equal_models(mapping):
+def test_equal_runs_give_equal_models(mapping, scene):
     first, second = (mapping.run("incremental")[0] for _ in range(2))
+    assert set(first.reg_image_ids()) == EVERY
+    assert largest_centre_error(first, scene) < 0.05
     assert state_of(first) == state_of(second)
 
 
@@ -132,8 +135,8 @@ def test_photos_that_follow_each_other_come_first_then_those_with_the_most_match
     assert _Growth._in_order(growth, [2, 3, 8, 9]) == [3, 9, 8, 2]
 
 
-def test_the_first_photos_follow_each_other(mapping):
+def test_the_first_photos_follow_each_other(quick):
     """Pairs of photos with a larger angle and more matches may be look-alikes."""
-    graph = ViewGraph.read(mapping.database)
-    pair = mapping._mapper(graph, relaxed=False).start(graph.names).reg_image_ids()
+    graph = ViewGraph.read(quick.database)
+    pair = quick._mapper(graph, relaxed=False).start(graph.names).reg_image_ids()
     assert abs(pair[0] - pair[1]) <= 2
