@@ -42,15 +42,6 @@ def test_bitwise_round_trip(tmp_path):
         assert again.tensors[name].numpy().tobytes() == tensor.contiguous().numpy().tobytes()
 
 
-def test_a_random_state_continues(tmp_path):
-    generator = torch.Generator().manual_seed(1)
-    torch.rand(17, generator=generator)
-    path = checkpoint.save(tmp_path, 1, {"random": generator.get_state()}, {})
-    expected = torch.rand(5, generator=generator)
-    generator.set_state(checkpoint.load(path).tensors["random"])
-    assert torch.equal(torch.rand(5, generator=generator), expected)
-
-
 def test_the_newest_by_number_are_kept(tmp_path):
     for step in (500, 999_500, 1_000_000, 1_000_500):
         checkpoint.save(tmp_path, step, {"a": torch.tensor(step)}, {})

@@ -65,10 +65,3 @@ def test_it_acts_in_every_tenth_step_until_its_end(step, acts):
     decay.between(stage(gaussians, step, views=10))
     assert torch.equal(gaussians.log_scales, scene().log_scales) != acts
     assert torch.equal(gaussians.opacity_logits, scene().opacity_logits) != acts
-
-
-def test_without_rates_nothing_changes():
-    gaussians = scene()
-    Decay(DecayRates()).between(stage(gaussians, INTERVAL, views=10))
-    for name, tensor in scene().parameters().items():
-        assert torch.equal(gaussians.parameters()[name], tensor)

@@ -108,8 +108,10 @@ def test_a_nonfinite_gradient_of_the_last_step_is_reported(dataset: Dataset) -> 
     assert_finite(trainer)
 
 
-@pytest.mark.parametrize("value", VALUES)
-@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logits", "sh_dc"])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    list(zip(["means", "log_scales", "quats", "opacity_logits", "sh_dc"], 2 * VALUES)),  # noqa: B905
+)
 def test_nonfinite_parameters(begun, name: str, value: float) -> None:
     trainer = begun(CALM)
     broken = trainer.gaussians.parameters()[name]
@@ -137,15 +139,6 @@ def test_an_invisible_nonfinite_gaussian_is_found_by_the_refinement(dataset, con
         trainer.run()
     one_line(error)
     assert trainer.step == 10
-
-
-def test_a_learning_rate_that_diverges(dataset: Dataset) -> None:
-    rate = 1e38
-    rates = replace(CALM.learning_rates, quats=rate, opacity_logits=rate)
-    trainer = Trainer(dataset, replace(CALM, learning_rates=rates))
-    with pytest.raises(Diverged, match="use lower learning rates"):
-        trainer.run()
-    assert_finite(trainer)
 
 
 def test_the_cause_of_a_nonfinite_loss_is_named(dataset: Dataset) -> None:

@@ -10,7 +10,13 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.limits import INTERVAL, NearLimit, nearest_depth, unseen_cameras
+from snowsplat.training.parts.limits import (
+    INTERVAL,
+    NearLimit,
+    beside,
+    nearest_depth,
+    unseen_cameras,
+)
 from snowsplat.training.settings.recipes import recipe
 
 from .stage import stage
@@ -70,6 +76,19 @@ def test_also_in_views_that_nobody_photographed():
     assert positions == pytest.approx([-4.5, 0.0, 0.0, 4.5], abs=1e-6)
 
 
+@pytest.mark.parametrize(("along", "share"), [(1.0, -0.5), (1.0, 0.25), (-1.0, -0.5)])
+def test_an_unseen_camera_is_on_the_line_through_two_cameras(along, share):
+    """Also if they look in opposite directions."""
+    first, second = camera(-3.0), camera(3.0, along)
+    moved = beside(first, second, share)
+    expected = (1.0 + share) * first.position - share * second.position
+    assert torch.allclose(moved.position, expected, atol=1e-9)
+    rotation = moved.cam_from_world[:, :3]
+    assert torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-9)
+    assert torch.det(rotation) == pytest.approx(1.0)
+    assert (moved.width, moved.fx, moved.cx) == (first.width, first.fx, first.cx)
+
+
 def test_near_a_camera_remains_what_two_photos_show():
     """The other cameras look away from the points, so they have no limits themselves."""
     front = [camera(0.0), camera(0.2), camera(0.4)]
@@ -104,13 +123,6 @@ def test_nothing_is_removed_without_points_and_between_the_steps_of_the_limit():
     assert torch.equal(gaussians.opacity_logits, before.opacity_logits)
 
 
-def test_many_cameras_are_sampled():
-    limit = NearLimit(0.5)
-    limit.begin(stage(cameras=[camera(0.001 * i) for i in range(500)], points=wall()))
-    assert limit._views is not None
-    assert len(limit._views.depths) <= 64 * 5
-
-
 def test_a_training_run_without_a_floater(tmp_path):
     """An opaque Gaussian in front of a camera is removed by density control."""
     dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 8, 48, 36, n_points=400))
@@ -123,9 +135,3 @@ def test_a_training_run_without_a_floater(tmp_path):
     trainer.run(until=INTERVAL + 1)
     distances = (trainer.gaussians.means - floater).norm(dim=1)
     assert float(distances.min()) > 0.05
-
-
-def test_recipes():
-    assert recipe("default").near_limit == 0.6
-    for name in ("classic", "paper", "mcmc", "mcmc-short"):
-        assert recipe(name).near_limit == 0.0

@@ -20,7 +20,7 @@ from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts import pose_refinement
 from snowsplat.training.parts.pose_coordinates import Gauge, after_motion, pixel_hessian, whitening
 from snowsplat.training.parts.pose_refinement import PoseRefinement
-from snowsplat.training.settings import TrainConfig, config_from_json, config_to_json
+from snowsplat.training.settings import TrainConfig
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.step.view_gradient import ViewGradient
 from snowsplat.util.errors import UserError
@@ -233,11 +233,8 @@ def test_without_refinement_the_cameras_are_those_of_the_dataset(dataset: Datase
     assert trainer.cameras.test_views() is dataset.test
 
 
-@pytest.mark.parametrize("batch", [1, 4])
-def test_resuming_is_bit_identical(
-    dataset: Dataset, batch: int, tmp_path: Path, monkeypatch
-) -> None:
-    config = recipe("default", **SHORT, batch=batch, refine_poses=True)
+def test_resuming_is_bit_identical(dataset: Dataset, tmp_path: Path, monkeypatch) -> None:
+    config = recipe("default", **SHORT, batch=4, refine_poses=True)
     monkeypatch.setattr(pose_refinement, "EXACT", 0.0)
     whole = Trainer(dataset, config)
     whole.run()
@@ -265,8 +262,3 @@ def test_one_camera_does_not_move(dataset: Dataset) -> None:
     trainer = Trainer(single, recipe("default", **SHORT, refine_poses=True))
     trainer.run(until=30)
     assert float(trainer.part(PoseRefinement).drift().rotations.max()) < 1e-6
-
-
-def test_the_setting_is_stored() -> None:
-    config = replace(TrainConfig(), refine_poses=True)
-    assert config_from_json(config_to_json(config)) == config

@@ -9,7 +9,6 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.training.parts.limits import INTERVAL, ScaleLimit
-from snowsplat.training.settings.recipes import recipe
 
 from .stage import stage
 
@@ -66,9 +65,3 @@ def test_many_cameras_are_sampled():
     assert math.isclose(float(gaussians.scales[2].max()), 0.005, rel_tol=1e-5)
     assert float(gaussians.scales[3].max()) < 1e-30
     assert math.isclose(float(gaussians.scales[1].max()), 3.0, rel_tol=1e-6)  # below the limit, 4
-
-
-def test_recipes():
-    assert recipe("default").relative_scale == 0.3
-    for name in ("classic", "paper", "mcmc", "mcmc-short"):
-        assert recipe(name).relative_scale == 0.0

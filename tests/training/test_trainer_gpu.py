@@ -90,8 +90,7 @@ def backward_by_hand(loss: Tensor, gradient: Tensor | None = None) -> None:
     node.variable.grad = grads[0]
 
 
-@pytest.mark.parametrize("batch", [1, 2])
-@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize(("deterministic", "batch"), [(False, 1), (True, 2)])
 @every_density_control
 def test_a_step_waits_for_nothing_and_mixes_no_devices(
     dataset: Dataset,
