@@ -151,7 +151,7 @@ CORRUPTIONS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_right_cameras(coloured: Dataset, matched: Dataset, scale: float) -> None:
     turn = rotation_from_quat(torch.tensor([0.3, -0.5, 0.7, 0.2], dtype=torch.float64)).numpy()
     for dataset in (coloured, matched):

@@ -40,8 +40,10 @@ def difference(a, b) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("ending", ["jpg", "png", "tif", "webp"])
+@pytest.mark.parametrize(
+    ("ending", "orientation"),
+    [*(("jpg", i) for i in range(1, 9)), ("png", 1), ("png", 6), ("tif", 6), ("webp", 1)],
+)
 def test_every_orientation_becomes_upright(ending, orientation, tmp_path):
     path = tmp_path / f"a.{ending}"
     stored(photo(), orientation).save(path, exif=exif({0x0112: orientation}), quality=95)
@@ -67,11 +69,10 @@ def test_colmap_ignores_the_exif_orientation(tmp_path):
     assert pycolmap.Bitmap.read(str(tmp_path / "a.jpg"), True).width == HEIGHT
 
 
-@pytest.mark.parametrize("orientation", [1, 6])
-def test_heic(orientation, tmp_path):
+def test_heic(tmp_path):
     pillow_heif.register_heif_opener()
     path = tmp_path / "IMG 1.HEIC"
-    stored(photo(), orientation).save(path, exif=exif({0x0112: orientation}).tobytes(), quality=95)
+    stored(photo(), 6).save(path, exif=exif({0x0112: 6}).tobytes(), quality=95)
     header = read_header(path)
     assert header.size(None) == (WIDTH, HEIGHT)
     assert not header.is_ready(None)
