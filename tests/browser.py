@@ -11,9 +11,11 @@ Tests that use it carry the mark `browser`, which skips them where there is no C
 
 from __future__ import annotations
 
+import atexit
 import base64
 import contextlib
 import fcntl
+import functools
 import io
 import json
 import os
@@ -82,28 +84,10 @@ class BrowserError(Exception):
     """A command was rejected, a script in a page failed, or a time limit was exceeded."""
 
 
-class Browser:
-    """A process of Chromium with a temporary profile; both are removed at the end.
+class _Process:
+    """A process of Chromium with a temporary profile. `close` ends it and removes the profile."""
 
-    Tabs have ``width`` × ``height`` CSS pixels, of ``scale`` pixels of the screen. Without a GPU,
-    the time to draw a page is proportional to the number of pixels of the screen. Scripts that
-    draw for each frame of the screen run at most ``frames`` times per second, because pages with
-    WebGL otherwise use the processor all the time. ``webgpu``: pages can use WebGPU, too.
-    """
-
-    def __init__(
-        self,
-        width: int = 640,
-        height: int = 480,
-        scale: float = 1.0,
-        frames: float = 10.0,
-        *,
-        webgpu: bool = False,
-    ) -> None:
-        self.width, self.height, self.scale, self.frames = width, height, scale, frames
-        self._flags = _WEBGPU_FLAGS if webgpu else _FLAGS
-
-    def __enter__(self) -> Browser:
+    def __init__(self, flags: list[str]) -> None:
         program = chromium()
         assert program is not None, "the test lacks the mark browser"
         self._profile = tempfile.mkdtemp(prefix="snowsplat-chromium-")
@@ -111,7 +95,6 @@ class Browser:
         self._replies, from_browser = _pipe()
         # Chromium reads commands from file descriptor 3 and writes responses to 4.
         shell = f'exec "$@" 3<&{to_browser} 4>&{from_browser}'
-        flags = [*self._flags, f"--window-size={self.width},{self.height}"]
         command = [program, *flags, f"--user-data-dir={self._profile}", "about:blank"]
         self._process = subprocess.Popen(
             ["bash", "-c", shell, "chromium", *command],
@@ -125,45 +108,26 @@ class Browser:
         self._last = 0
         self._writing = threading.Lock()
         self._waiting: dict[int, Queue[dict[str, Any]]] = {}
-        self._pages: dict[str, Page] = {}
+        self.pages: dict[str, Page] = {}
         threading.Thread(target=self._read, daemon=True).start()
-        return self
 
-    def __exit__(self, *_: object) -> None:
+    @property
+    def runs(self) -> bool:
+        return self._process.poll() is None
+
+    def close(self) -> None:
         with contextlib.suppress(BrowserError, OSError, subprocess.TimeoutExpired):
             self.call("Browser.close", timeout=5)
             self._process.wait(5)
-        # If it is still running, kill its whole group, with the renderers and the GPU process.
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
+        self.kill()
         os.close(self._commands)
         shutil.rmtree(self._profile, ignore_errors=True)
 
-    def open(self, url: str, timeout: float = 30.0, language: str = "en-US") -> Page:
-        """Open a new tab that shows ``url``; waits until its document is loaded.
-
-        ``language``: what the page takes for the language of the browser.
-        """
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        page = self._pages[session] = Page(self, session, target)
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            page.call(f"{domain}.enable")
-        page.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=self.width,
-            height=self.height,
-            deviceScaleFactor=self.scale,
-            mobile=False,
-        )
-        page.call(
-            "Page.addScriptToEvaluateOnNewDocument", source=_SLOW_FRAMES % (1e3 / self.frames)
-        )
-        agent = page.evaluate("navigator.userAgent")
-        page.call("Emulation.setUserAgentOverride", userAgent=agent, acceptLanguage=language)
-        page.navigate(url, timeout)
-        return page
+    def kill(self) -> None:
+        """Kill its whole group, with the renderers and the GPU process, if it is still running."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
 
     def call(
         self, method: str, session: str | None = None, timeout: float = 60.0, **parameters: Any
@@ -202,8 +166,84 @@ class Browser:
             answer = self._waiting.pop(message["id"], None)
             if answer is not None:
                 answer.put(message)
-        elif (page := self._pages.get(message.get("sessionId", ""))) is not None:
+        elif (page := self.pages.get(message.get("sessionId", ""))) is not None:
             page._event(message["method"], message["params"])
+
+
+@functools.cache
+def _shared() -> _Process:
+    """The process that the browsers without WebGPU share: to start one takes a second."""
+    process = _Process(_FLAGS)
+    atexit.register(process.close)
+    return process
+
+
+class Browser:
+    """A browser of its own: it shares only the process with others, not what pages store.
+
+    Tabs have ``width`` × ``height`` CSS pixels, of ``scale`` pixels of the screen. Without a GPU,
+    the time to draw a page is proportional to the number of pixels of the screen. Scripts that
+    draw for each frame of the screen run at most ``frames`` times per second, because pages with
+    WebGL otherwise use the processor all the time. ``webgpu``: pages can use WebGPU, too.
+    """
+
+    def __init__(
+        self,
+        width: int = 640,
+        height: int = 480,
+        scale: float = 1.0,
+        frames: float = 10.0,
+        *,
+        webgpu: bool = False,
+    ) -> None:
+        self.width, self.height, self.scale, self.frames = width, height, scale, frames
+        self._webgpu = webgpu
+
+    def __enter__(self) -> Browser:
+        if not self._webgpu and not _shared().runs:
+            _shared.cache_clear()
+        self._process = _Process(_WEBGPU_FLAGS) if self._webgpu else _shared()
+        made = self._process.call("Target.createBrowserContext", disposeOnDetach=True)
+        self._context = made["browserContextId"]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._webgpu:
+            self._process.close()
+            return
+        with contextlib.suppress(BrowserError, OSError):  # after a crash
+            self._process.call("Target.disposeBrowserContext", browserContextId=self._context)
+
+    def kill(self) -> None:
+        """Kill the process with all its browsers."""
+        self._process.kill()
+
+    def open(self, url: str, timeout: float = 30.0, language: str = "en-US") -> Page:
+        """Open a new tab that shows ``url``; waits until its document is loaded.
+
+        ``language``: what the page takes for the language of the browser.
+        """
+        blank = {"url": "about:blank", "browserContextId": self._context}
+        target = self._process.call("Target.createTarget", **blank)["targetId"]
+        attached = self._process.call("Target.attachToTarget", targetId=target, flatten=True)
+        session = attached["sessionId"]
+        page = self._process.pages[session] = Page(self._process, session, target)
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            page.call(f"{domain}.enable")
+        page.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=self.width,
+            height=self.height,
+            deviceScaleFactor=self.scale,
+            mobile=False,
+        )
+        page.call(
+            "Page.addScriptToEvaluateOnNewDocument", source=_SLOW_FRAMES % (1e3 / self.frames)
+        )
+        agent = page.evaluate("navigator.userAgent")
+        page.call("Emulation.setUserAgentOverride", userAgent=agent, acceptLanguage=language)
+        page.navigate(url, timeout)
+        return page
 
 
 class Page:
@@ -214,8 +254,8 @@ class Page:
         requests: the addresses that the page requested.
     """
 
-    def __init__(self, browser: Browser, session: str, target: str) -> None:
-        self._browser, self._session, self._target = browser, session, target
+    def __init__(self, process: _Process, session: str, target: str) -> None:
+        self._process, self._session, self._target = process, session, target
         self.console: deque[str] = deque(maxlen=1000)
         self.requests: deque[str] = deque(maxlen=1000)
         self._loaded = threading.Event()
@@ -227,7 +267,7 @@ class Page:
 
     def call(self, method: str, timeout: float = 60.0, **parameters: Any) -> dict[str, Any]:
         """Send one command of the DevTools protocol to this tab."""
-        return self._browser.call(method, self._session, timeout, **parameters)
+        return self._process.call(method, self._session, timeout, **parameters)
 
     def navigate(self, url: str, timeout: float = 30.0) -> None:
         """Show another address; waits until its document is loaded."""
@@ -303,7 +343,7 @@ class Page:
 
     def close(self) -> None:
         """Close the tab."""
-        self._browser.call("Target.closeTarget", targetId=self._target)
+        self._process.call("Target.closeTarget", targetId=self._target)
 
     def _mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)

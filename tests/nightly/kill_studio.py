@@ -453,7 +453,7 @@ class Kills:
             try:
                 yield browser.open(f"{self.server.url}#{name}", timeout=120)
             finally:
-                os.killpg(browser._process.pid, signal.SIGKILL)
+                browser.kill()
 
     def _choose(self, page: Any) -> None:
         page.wait_for("!!document.querySelector('input[type=file]')", 120)

@@ -112,17 +112,20 @@ def set_sliders(page: Page, crop: int, floaters: int) -> None:
     )
 
 
-def psnr(shown: np.ndarray, scene: ReadyScene, kept: torch.Tensor) -> float:
-    """Of a picture of the page, compared with a rendering of the Gaussians kept."""
-    camera = scene.start.camera(WIDTH, HEIGHT)
-    with torch.no_grad():
-        image = render(scene.gaussians.select(kept), camera).image.clamp(0, 1).mul(255).numpy()
+def psnr(shown: np.ndarray, image: np.ndarray) -> float:
     return -10 * math.log10(np.mean((shown.astype(float) - image) ** 2) / 255**2 + 1e-9)
 
 
-def soon_shown(page: Page, scene: ReadyScene, kept: torch.Tensor) -> np.ndarray:
-    """A picture of the page that shows the Gaussians kept."""
-    return page.wait_for_picture(lambda shown: psnr(shown, scene, kept) > 30)
+def picture(scene: ReadyScene, kept: torch.Tensor) -> np.ndarray:
+    """A rendering of the Gaussians kept, as in the window of the page."""
+    camera = scene.start.camera(WIDTH, HEIGHT)
+    with torch.no_grad():
+        return render(scene.gaussians.select(kept), camera).image.clamp(0, 1).mul(255).numpy()
+
+
+def soon_shown(page: Page, image: np.ndarray) -> np.ndarray:
+    """A picture of the page that is similar."""
+    return page.wait_for_picture(lambda shown: psnr(shown, image) > 30)
 
 
 @pytest.mark.browser
@@ -147,23 +150,27 @@ def test_the_sliders(trained, tmp_path, webgpu):
         assert kind == ("webgpu" if webgpu else "webgl2")
         page.evaluate("document.querySelector('.snow-panel').style.opacity = 0")
         page.evaluate("document.querySelector('.sse-ui').style.opacity = 0")
-        soon_shown(page, scene, everything)
-        for values, kept in (((70, 0), cropped), ((0, 50), small), ((70, 50), cropped & small)):
+        whole, part = picture(scene, everything), picture(scene, cropped)
+        soon_shown(page, whole)
+        for values, image in (
+            ((70, 0), part),
+            ((0, 50), picture(scene, small)),
+            ((70, 50), picture(scene, cropped & small)),
+        ):
             set_sliders(page, *values)
-            shown = soon_shown(page, scene, kept)
-            assert psnr(shown, scene, everything) < 30, values
+            assert psnr(soon_shown(page, image), whole) < 30, values
         # The link has the values; at 0, nothing is hidden.
         page.evaluate("[...document.querySelectorAll('.snow-buttons button')].at(-1).click()")
         link = page.wait_for("location.hash", 10)
         assert link.endswith("&hide=70,50")
         set_sliders(page, 0, 0)
-        soon_shown(page, scene, everything)
+        soon_shown(page, whole)
         page.evaluate("location.hash = '#hide=70,0'")
-        soon_shown(page, scene, cropped)
+        soon_shown(page, part)
         for wrong in ("#hide=70", "#hide=70,101", "#hide=a,b", "#hide=-1,0", "#"):
             page.evaluate(f"location.hash = '{wrong}'")
             page.wait_for(f"String({SLIDERS}.map(s => s.value)) === '0,0'", 10)
-        soon_shown(page, scene, everything)
+        soon_shown(page, whole)
         assert not page.errors
 
 
@@ -178,7 +185,7 @@ def test_a_page_without_cameras_begins_without_floaters(tmp_path):
         assert page.evaluate(f"{SLIDERS}.map(s => Number(s.value))") == [0, scene.hiding.start]
         page.evaluate("document.querySelector('.snow-panel').style.opacity = 0")
         page.evaluate("document.querySelector('.sse-ui').style.opacity = 0")
-        soon_shown(page, scene, torch.arange(1010) < 1000)
+        soon_shown(page, picture(scene, torch.arange(1010) < 1000))
         brightness = page.screenshot().mean()
         set_sliders(page, 0, 0)
         page.wait_for_picture(lambda shown: shown.mean() >= brightness + 10)  # the floaters

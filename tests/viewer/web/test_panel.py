@@ -127,17 +127,11 @@ def test_the_panel(file, scene):
         page.evaluate(f"location.hash = '#view={','.join(map(str, stops[5]))}'")
         wait_for_pose(page, pose_of(stops[5]))
         press(page, "r")
-        wait_for_pose(page, pose_of(start[0]))
-
-
-@pytest.mark.browser
-def test_links_that_are_no_views(file, scene):
-    start = pose_of(view_numbers(scene.start, scene.start.aspect))
-    with opened(file, 300, 300, "#view=1,2,3") as page:
+        # Links that are no views.
         for link in ("#", "#view=1,1,1,1,1,1,50", "#view=a,b,c,d,e,f,g", "#view=0,0,0,1,1,1,0"):
-            wait_for_pose(page, start)
+            wait_for_pose(page, pose_of(start[0]))
             page.evaluate(f"location.hash = '{link}'")
-        wait_for_pose(page, start)
+        wait_for_pose(page, pose_of(start[0]))
 
 
 @pytest.mark.browser
@@ -154,6 +148,11 @@ def test_windows_of_any_shape_show_the_complete_photo(file, scene):
             fov = math.degrees(2 * math.atan(max(width, height) / 2 / camera.fx))
             page.wait_for(f"Math.abs({component}.fov - {fov}) < 0.01", 30)
             assert page.evaluate(f"{component}.horizontalFov") == (width > height)
+        # A failure of the loaded page is not shown.
+        page.wait_for("window.sse.viewer?.state.loaded", 60)
+        failure = "{promise: Promise.resolve(), reason: 'no full screen'}"
+        page.evaluate(f"dispatchEvent(new PromiseRejectionEvent('unhandledrejection', {failure}))")
+        assert not page.evaluate(f"!!{FAILURE}")
 
 
 @pytest.mark.browser
@@ -224,7 +223,7 @@ def test_what_photos_show_beside_a_photo():
 
 
 @pytest.mark.browser
-def test_the_texts_are_chinese_in_a_browser_in_chinese(file):
+def test_the_texts_are_chinese_in_a_browser_in_chinese(file, scene):
     with Browser(600, 400, 0.25, frames=5.0) as browser:
         page = browser.open(f"{file.as_uri()}?webgl", language="zh-CN")
         page.wait_for("!!document.querySelector('.snow-panel')", 60)
@@ -235,43 +234,30 @@ def test_the_texts_are_chinese_in_a_browser_in_chinese(file):
         assert re.search(r"[0-9] 个高斯 · 2026-11-24 · CC0", text)
         assert not re.search(r"[A-Za-z]", text.replace("Balls <&>", "").replace("CC0", ""))
         assert page.evaluate("document.querySelector('.sse-settings').ariaLabel") == "设置"
-        page.navigate(f"{file.as_uri()}?webgl&lang=en")
+        page.navigate(f"{file.as_uri()}?webgl&lang=en#view=1,2,3")
         page.wait_for("!!document.querySelector('.snow-panel')", 60)
         assert "Clean up" in page.evaluate("document.querySelector('.snow-panel').innerText")
+        page.wait_for("!!window.app", 60)
+        wait_for_pose(page, pose_of(view_numbers(scene.start, scene.start.aspect)))
         assert not page.errors
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("asked", ["", "?webgl"])
-def test_a_browser_without_webgl_is_told_so(file, asked):
+def test_a_browser_that_is_too_old_is_told_so(file):
+    no_webgl = "HTMLCanvasElement.prototype.getContext = () => null"
+    no_modules = "delete HTMLScriptElement.prototype.noModule"
     with Browser(600, 400, 0.25, frames=5.0) as browser:
-        page = browser.open("about:blank")
-        none = "HTMLCanvasElement.prototype.getContext = () => null"
-        page.call("Page.addScriptToEvaluateOnNewDocument", source=none)
-        page.navigate(f"{file.as_uri()}{asked}")
-        told = page.wait_for(FAILURE)
-        assert told.startswith("This browser has no WebGL 2")
-        assert "请使用其他浏览器" in told
-        assert any("WebGL not supported" in error for error in page.errors)
-
-
-@pytest.mark.browser
-def test_a_browser_without_modules_is_told_so(file):
-    with Browser(600, 400, 0.25, frames=5.0) as browser:
-        page = browser.open("about:blank")
-        old = "delete HTMLScriptElement.prototype.noModule"
-        page.call("Page.addScriptToEvaluateOnNewDocument", source=old)
-        page.navigate(file.as_uri())
-        assert page.wait_for(FAILURE).startswith("This browser is too old")
-
-
-@pytest.mark.browser
-def test_a_failure_of_the_loaded_page_is_not_shown(file):
-    with opened(file, 600, 400) as page:
-        page.wait_for("window.sse.viewer?.state.loaded", 60)
-        failure = "{promise: Promise.resolve(), reason: 'no full screen'}"
-        page.evaluate(f"dispatchEvent(new PromiseRejectionEvent('unhandledrejection', {failure}))")
-        assert not page.evaluate("!!document.querySelector('.snow-failure')")
+        for lacks, asked in ((no_webgl, ""), (no_webgl, "?webgl"), (no_modules, "")):
+            page = browser.open("about:blank")
+            page.call("Page.addScriptToEvaluateOnNewDocument", source=lacks)
+            page.navigate(f"{file.as_uri()}{asked}")
+            told = page.wait_for(FAILURE)
+            if lacks == no_modules:
+                assert told.startswith("This browser is too old")
+                continue
+            assert told.startswith("This browser has no WebGL 2")
+            assert "请使用其他浏览器" in told
+            assert any("WebGL not supported" in error for error in page.errors)
 
 
 @pytest.mark.browser
