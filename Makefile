@@ -151,6 +151,8 @@ ISA := isa and not (emulated or gpu or nightly)
 # so finite differences would only test the reference again.
 SAME := test_determinism or number_of_threads or in_parallel or long_images or \
     (finite_differences and (test_photometric or test_project or test_rasterize))
+# Repeated tests have few of their cases: each value of each parameter. `make nightly` repeats all of them.
+CASES = few
 # Under sanitizers, one precision is enough: both have the same source. One test is about the sanitizers.
 SANITIZED := emulated-float32 or sanitizers_find
 REPEATED := build/pytest-repeated.log
@@ -160,8 +162,8 @@ pytest-quick: native $(ENVIRONMENT)
 
 # All tests on the best instruction set. Some of them wait for browsers and servers. Therefore, at the same
 # time, with half as many processes and a lower priority: on each other instruction set and in an emulator
-# of Arm, the tests that depend on it; and the GPU kernels on the CPU under sanitizers. Tests that run under sanitizers are not
-# repeated without them.
+# of Arm, the tests that depend on it; and the GPU kernels on the CPU under sanitizers. Tests that run under
+# sanitizers are not repeated without them.
 pytest: native $(ENVIRONMENT)
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
 
@@ -169,8 +171,9 @@ pytest-best:
 	$(PYTEST) -m 'not nightly' $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
 nightly: native $(ENVIRONMENT)
-	@$(MAKE) --no-print-directory pytest-isas ISA_SKIPPED='$(SAME)'
-	@$(MAKE) --no-print-directory neon NEON_SKIPPED='float64 or $(SAME)'
+	@$(MAKE) --no-print-directory pytest-isas CASES=all ISA_SKIPPED='$(SAME)'
+	@$(MAKE) --no-print-directory sanitized CASES=all
+	@$(MAKE) --no-print-directory neon CASES=all NEON_SKIPPED='float64 or $(SAME)'
 	$(PYTEST) -m nightly
 
 # The kernels for Arm (NEON), in an emulator, which takes five times as long as the processor: with the
@@ -184,7 +187,7 @@ NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v q
 
 neon: native $(ENVIRONMENT)
 	@$(if $(NEON_FOUND),echo "neon: $(PYTEST) -m '$(ISA)'" $(NEON_TESTS); \
-	    SNOWSPLAT_NEON=run $(PYTEST) -m '$(ISA)' $(NEON_TESTS), \
+	    SNOWSPLAT_CASES=$(CASES) SNOWSPLAT_NEON=run $(PYTEST) -m '$(ISA)' $(NEON_TESTS), \
 	    echo "neon: skipped; it needs a compiler and an emulator (Debian/Ubuntu: apt install g++-aarch64-linux-gnu qemu-user)")
 
 # Prints everything if a test fails, otherwise only the numbers of tests.
@@ -193,8 +196,9 @@ pytest-repeated:
 	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|neon|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
-# With the precision that trainings use: float64, for references, has the same source.
-ISA_SKIPPED = float64 or $(SAME)
+# With the precision that trainings use: float64, for references, has the same source. Random values are
+# for `make nightly`.
+ISA_SKIPPED = float64 or test_random_extremes or $(SAME)
 ISA_TESTS := tests/ops tests/sfm/colmap/pairs/test_matching.py tests/sfm/colmap/features/test_sift.py \
     tests/training/test_pose_refinement.py tests/training/test_step_runner.py -k 'not ($(ISA_SKIPPED))'
 # All lower instruction sets. Each change is tested with the next lower one, and with NEON, whose kernels
@@ -204,7 +208,7 @@ pytest-isas:
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()$(LOWER))') && \
 	    for isa in $$isas; do \
 	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)'" $(ISA_TESTS); \
-	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' $(ISA_TESTS) || exit 1; \
+	        SNOWSPLAT_CASES=$(CASES) SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' $(ISA_TESTS) || exit 1; \
 	    done
 
 # The GPU kernels on the CPU under AddressSanitizer and UndefinedBehaviorSanitizer, with the threads of a
@@ -216,7 +220,7 @@ SANITIZERS = $(strip $(foreach name,libasan.so libubsan.so,$(wildcard $(shell g+
 sanitized: native $(ENVIRONMENT)
 	@$(if $(SANITIZERS),echo "sanitized: $(PYTEST) tests/ops -m emulated -k '$(SANITIZED)'"; \
 	    LD_PRELOAD="$(SANITIZERS)" ASAN_OPTIONS=detect_leaks=0:malloc_context_size=1 CXX=g++ \
-	    SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
+	    SNOWSPLAT_CASES=$(CASES) SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
 	    $(PYTEST) tests/ops -m emulated -k '$(SANITIZED)', \
 	    echo "sanitized: skipped; it needs g++ with its sanitizers")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
@@ -45,6 +46,29 @@ def _isa_is_marked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
         pytest.fail(f"runs the kernel {name} of the CPU; mark the test `isa`")
 
     monkeypatch.setitem(LAUNCHERS, "cpu", unmarked)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """With SNOWSPLAT_CASES=few, of the cases of a test only so many that each value of each
+    parameter occurs: for runs that repeat the tests (see the Makefile).
+    """
+    if os.environ.get("SNOWSPLAT_CASES") != "few":
+        return
+    cases: dict[object, list[pytest.Function]] = {}
+    for item in items:
+        if isinstance(item, pytest.Function) and hasattr(item, "callspec"):
+            engines = tuple(v for v in item.callspec.params.values() if isinstance(v, Variant))
+            cases.setdefault((item.path, item.originalname, engines), []).append(item)
+    superfluous: set[pytest.Item] = set()
+    for among in cases.values():
+        values = {item: {(k, repr(v)) for k, v in item.callspec.params.items()} for item in among}
+        missing = set().union(*values.values())
+        while missing:
+            best = max(values, key=lambda item: len(values[item] & missing))
+            missing -= values.pop(best)
+        superfluous |= values.keys()
+    config.hook.pytest_deselected(items=list(superfluous))
+    items[:] = [item for item in items if item not in superfluous]
 
 
 def variants(*among: Variant) -> list:

@@ -1,9 +1,6 @@
 """The emulation of CUDA blocks: it detects faults, and its results are correct."""
 
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,7 +10,6 @@ from snowsplat.util.native_layout import Mismatch
 
 from . import emulation
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 LANES = torch.arange(32, dtype=torch.int32)
 
 pytestmark = pytest.mark.emulated
@@ -108,76 +104,22 @@ OUT_OF_BOUNDS = {
 }
 
 
-def statuses_of_forks(folder: str) -> list[int]:
-    """Exit status of each call of OUT_OF_BOUNDS; standard error goes to a file in ``folder``.
-
-    A sanitizer ends the process, and Python starts slowly under sanitizers: each call is made in a
-    fork of this process.
-    """
-    statuses = []
-    for number, call in enumerate(OUT_OF_BOUNDS):
-        child = os.fork()
-        if child == 0:
-            log = os.open(f"{folder}/{number}", os.O_WRONLY | os.O_CREAT)
-            os.dup2(log, 2)
-            try:
-                eval(call)
-            finally:
-                os._exit(0)
-        statuses.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-    return statuses
-
-
-@pytest.fixture(scope="module")
-def sanitized(tmp_path_factory) -> dict[str, tuple[int, str]]:
-    """Exit status and standard error of each call of OUT_OF_BOUNDS under the sanitizers.
-
-    The calls are made in a new process, unless this one runs under sanitizers (`make sanitized`).
-    """
-    folder = str(tmp_path_factory.mktemp("sanitized"))
-    if os.environ.get("SNOWSPLAT_EMULATION") == "sanitized":
-        return results(folder, statuses_of_forks(folder))
-    compiler = os.environ.get("CXX", "c++")
-    libraries = []
-    for name in ("libasan.so", "libubsan.so"):
-        command = [compiler, f"-print-file-name={name}"]
-        path = subprocess.run(command, capture_output=True, text=True).stdout.strip()
-        if not os.path.isabs(path):
-            pytest.skip(f"needs {name}, which comes with GCC")
-        libraries.append(path)
-    environment = os.environ | {
-        "LD_PRELOAD": " ".join(libraries),
-        "ASAN_OPTIONS": "detect_leaks=0",
-        "SNOWSPLAT_EMULATION": "sanitized",
-        "PYTHONPATH": os.pathsep.join((str(REPOSITORY), str(REPOSITORY / "src"))),
-    }
-    code = (
-        "import sys; from tests.ops.test_emulation import statuses_of_forks;"
-        "print(*statuses_of_forks(sys.argv[1]))"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", code, folder],
-        env=environment,
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 0, result.stderr
-    return results(folder, [int(status) for status in result.stdout.split()])
-
-
-def results(folder: str, statuses: list[int]) -> dict[str, tuple[int, str]]:
-    return {
-        call: (status, Path(folder, str(number)).read_text(errors="replace"))
-        for number, (call, status) in enumerate(zip(OUT_OF_BOUNDS, statuses, strict=True))
-    }
-
-
+@pytest.mark.skipif(
+    os.environ.get("SNOWSPLAT_EMULATION") != "sanitized", reason="runs in `make sanitized`"
+)
 @pytest.mark.parametrize(("call", "found"), OUT_OF_BOUNDS.items())
-def test_the_sanitizers_find_accesses_out_of_bounds(call, found, sanitized):
-    status, log = sanitized[call]
-    assert status != 0
-    assert found in log
+def test_the_sanitizers_find_accesses_out_of_bounds(call, found, tmp_path):
+    """A sanitizer ends the process, and Python starts slowly under sanitizers: hence a fork."""
+    child = os.fork()
+    if child == 0:
+        log = os.open(tmp_path / "log", os.O_WRONLY | os.O_CREAT)
+        os.dup2(log, 2)
+        try:
+            eval(call)
+        finally:
+            os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
+    assert found in (tmp_path / "log").read_text(errors="replace")
 
 
 def test_threads_and_parameters_are_checked():
