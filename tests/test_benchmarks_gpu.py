@@ -136,6 +136,7 @@ def test_the_sanitizer_program_runs_every_kernel(fake_gpu, monkeypatch):
 
 
 @pytest.mark.emulated
+@pytest.mark.nightly
 def test_the_measuring_parts_run(fake_gpu, capsys, tmp_path):
     """Each stage of a step has a time, a lower bound and a row of the page."""
     import gpu_floor

@@ -180,6 +180,7 @@ def test_a_dataset_is_trained_with_its_poses(run, refused, dataset, tmp_path, mo
 
 
 @pytest.mark.sfm
+@pytest.mark.nightly  # it takes a minute; tests/pipeline/test_make_plan.py tests the plan
 def test_a_short_time_for_many_photos_uses_fewer(run, tmp_path, monkeypatch):
     """On a slow machine; the same command again repeats nothing and keeps the plan."""
     monkeypatch.setattr(make_module, "_MIN_SECONDS", 1.0)

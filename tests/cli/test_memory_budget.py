@@ -31,7 +31,7 @@ def snowsplat_cli(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four photos under many names (hard links)."""
     folder: Path = tmp_path_factory.mktemp("large")
     random = np.random.default_rng(0)
@@ -51,7 +51,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_dataset_of_four_times_the_memory_trains(dataset: Path, tmp_path: Path) -> None:
+@pytest.mark.nightly  # it takes a minute; tests/training/test_memory_budget.py tests the plan
+def test_a_dataset_of_four_times_the_memory_trains(large: Path, tmp_path: Path) -> None:
     arguments = (
         "-o",
         str(tmp_path / "out"),
@@ -59,7 +60,7 @@ def test_a_dataset_of_four_times_the_memory_trains(dataset: Path, tmp_path: Path
         f"{BUDGET // 10**6}MB",
         *("--iterations", "25", "--densify-from-iter", "10", "--densify-interval", "10"),
     )
-    run = snowsplat_cli("train", str(dataset), *arguments)
+    run = snowsplat_cli("train", str(large), *arguments)
     assert run.returncode == 0, run.stderr
     line = r"^training on .* threads, \w+; memory: [\d.]+ MB at most \(.*photos [\d.]+ MB\)$"
     assert re.search(line, run.stdout, re.MULTILINE)

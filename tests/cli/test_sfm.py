@@ -79,25 +79,23 @@ def test_layout_is_that_of_convert_py(garden, photos):
 
 
 def test_finished_stages_are_skipped_and_a_changed_photo_is_detected(garden, photos, run, tmp_path):
-    out, mine = tmp_path / "garden", tmp_path / "mine"
-    shutil.copytree(photos, mine)
-    assert run("sfm", mine, "-o", out, *QUICK).code == 0
-    before = times(out)
-    again = run("sfm", mine, "-o", out, *QUICK)
+    before = times(garden)
+    again = run("sfm", photos, "-o", garden, *QUICK, "--resize")
     assert again.code == 0
     assert again.out.count("done before") == len(STAGES)
-    assert times(out) == before
-    mine, out = mine.rename(tmp_path / "renamed"), out.rename(tmp_path / "moved")
-    again = run("sfm", mine, "-o", out, *QUICK)
+    assert times(garden) == before
+    mine = shutil.copytree(photos, tmp_path / "renamed")
+    out = shutil.copytree(garden, tmp_path / "moved")
+    again = run("sfm", mine, "-o", out, *QUICK, "--resize")
     assert again.out.count("done before") == len(STAGES), again.err
 
-    again = run("sfm", mine, "-o", out, *QUICK, "--resize")
+    again = run("sfm", mine, "-o", out, *QUICK)
     assert "images: repeated (changed: resize)" in again.out
     assert again.out.count("done before") == 2
 
     last = max(mine.iterdir())
     last.unlink()
-    again = run("sfm", mine, "-o", out, *QUICK, "--resize")
+    again = run("sfm", mine, "-o", out, *QUICK)
     assert "photos: repeated (changed: input)" in again.out
     assert not (out / "input" / last.name).exists()
     assert not (out / "images" / last.name).exists()
@@ -196,7 +194,7 @@ def test_a_failure_leaves_no_files(refused, photos, tmp_path):
 
 
 def test_a_full_disk_keeps_finished_stages(garden, photos, run, tmp_path, monkeypatch):
-    out = tmp_path / "garden"
+    out = shutil.copytree(garden, tmp_path / "garden")
 
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -209,6 +207,7 @@ def test_a_full_disk_keeps_finished_stages(garden, photos, run, tmp_path, monkey
     result = run("sfm", photos, "-o", out, *QUICK)
     assert result.code == 0
     assert result.out.count("done before") == 2
+    assert not (out / "images_2").exists()  # that of the command with --resize
 
 
 @pytest.mark.parametrize("command", ["sfm", "make"])
@@ -219,7 +218,7 @@ def test_without_pycolmap_the_remedy_is_named(photos, tmp_path, command):
     (package / "__init__.py").write_text(missing)
     paths = [str(package.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     found = subprocess.run(
-        [sys.executable, "-m", "snowsplat", command, photos, "-o", tmp_path / "new"],
+        [sys.executable, "-m", "snowsplat", command, photos, "-o", tmp_path / "new", *QUICK],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,
         text=True,

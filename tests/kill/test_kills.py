@@ -64,6 +64,7 @@ def test_train(killer, dataset):
     assert not killer.kill(train_jobs(dataset), 4 * TIMES)
 
 
+@pytest.mark.nightly  # a part of `make`
 def test_sfm(killer, photos):
     assert not killer.kill(sfm_jobs(photos), 3 * TIMES)
 
