@@ -213,6 +213,9 @@ def test_agreement_of_a_model_is_that_of_the_worst_of_the_strongest_pairs():
     assert agreement_of(bent + false) == pytest.approx((2 * 0.8 + 3) / 5)
     assert agreement_of(bent[:5]) == pytest.approx((2 * 0.8 + 1) / 3)
     assert agreement_of([]) == 0.0
+    few = [CheckedPair(i, i + 1, 15, 9, follows=True, agreeing=0.6) for i in range(1, 99)]
+    assert agreement_of(right + few) == 1.0
+    assert agreement_of(few) == pytest.approx(0.6)
 
 
 def test_misses_do_not_count():

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from snowsplat.scene.epipolar import Floats
 from snowsplat.sfm.colmap.checks.matches import read_matches
-from snowsplat.sfm.colmap.database import VerifiedPair, closing_database
+from snowsplat.sfm.colmap.database import MIN_MATCHES, VerifiedPair, closing_database
 from snowsplat.sfm.colmap.lenses.lens import pixels_per_radian
 from snowsplat.sfm.colmap.mapping.view_graph import database_names, following_pairs
 
@@ -98,14 +98,15 @@ class CheckedPair(VerifiedPair):
 def agreement_of(pairs: Sequence[CheckedPair]) -> float:
     """How well the poses agree with the matches where they agree least: 0 to 1.
 
-    The strongest pair of each photo counts: its matches are rarely false. Where a model is bent, or
-    where parts of different scales meet, many of these matches do not agree with the poses, and
-    their features observe no point. On repeating structures, some are false: these are misses, and
-    do not count. The result is the mean of the pairs of which the least share agrees (`_WORST`, at
-    least `_MIN_WORST` pairs): a model of many photos may be bent in one place.
+    The strongest pair of each photo counts: its matches are rarely false, unless they are so few
+    that unrelated photos may have as many. Where a model is bent, or where parts of different
+    scales meet, many of these matches do not agree with the poses, and their features observe no
+    point. On repeating structures, some are false: these are misses, and do not count. The result
+    is the mean of the pairs of which the least share agrees (`_WORST`, at least `_MIN_WORST`
+    pairs): a model of many photos may be bent in one place.
     """
     strongest: dict[int, CheckedPair] = {}
-    for pair in pairs:
+    for pair in [pair for pair in pairs if pair.matches >= MIN_MATCHES] or pairs:
         for photo in (pair.first, pair.second):
             if photo not in strongest or pair.weight > strongest[photo].weight:
                 strongest[photo] = pair
