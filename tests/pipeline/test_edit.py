@@ -2,6 +2,7 @@
 
 import base64
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,9 +36,23 @@ def bits(rows: np.ndarray) -> str:
     return base64.b64encode(np.packbits(rows, bitorder="little").tobytes()).decode()
 
 
-@pytest.fixture(params=[False, True], ids=["file", "cameras"])
-def scene(request, tmp_path):
-    return write_scene(tmp_path, with_cameras=request.param)
+@pytest.fixture(scope="module")
+def published(tmp_path_factory):
+    """Scenes and their pages, without and with cameras."""
+    folders = [tmp_path_factory.mktemp(name) for name in ("file", "cameras")]
+    for with_cameras, folder in enumerate(folders):
+        write_scene(folder, bool(with_cameras))
+    return folders
+
+
+@pytest.fixture
+def scene(request, published, tmp_path):
+    """In the folder of `make`, with cameras, unless a test is marked with `either`."""
+    shutil.copytree(published[getattr(request, "param", 1)], tmp_path, dirs_exist_ok=True)
+    return tmp_path / "made" / "tour.ply"
+
+
+either = pytest.mark.parametrize("scene", [0, 1], ids=["file", "cameras"], indirect=True)
 
 
 def write_scene(folder: Path, with_cameras: bool) -> Path:
@@ -62,6 +77,7 @@ def write_scene(folder: Path, with_cameras: bool) -> Path:
     return file
 
 
+@either
 def test_what_is_removed_in_the_page_is_removed_in_the_scene(scene, tmp_path):
     before = scene.read_bytes()
     gone = np.random.default_rng(1).random(N) < 0.4
@@ -141,6 +157,7 @@ def settings_of(site: Path) -> dict:
     return json.loads(page.split('id="sse-bootstrap">')[1].split("</script>")[0])["settings"]
 
 
+@either
 def test_scale_view_and_title(scene, tmp_path):
     first = PageEdit(N, bits(np.arange(N) < 1), 2.0, "New", VIEW)
     target = edit(scene, tmp_path / "site", first)
@@ -173,6 +190,7 @@ def test_scale_view_and_title(scene, tmp_path):
     assert [each.name for each in scene.parent.glob("tour*")] == ["tour.ply"]
 
 
+@either
 def test_a_person_turns_the_scene(scene, tmp_path):
     """The page shows it as it was turned, although the cameras say otherwise; so does a film."""
     site, (original, before) = tmp_path / "site", (scene.read_bytes(), read_sog_places(tmp_path))
