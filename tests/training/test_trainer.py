@@ -120,12 +120,12 @@ def trained(dataset: Dataset, config: TrainConfig) -> Gaussians:
 
 @pytest.mark.slow
 def test_training_learns_and_has_the_same_losses_in_float64(dataset, monkeypatch):
-    """130 of the 300 steps, up to the highest SH degree, have the losses of the reference ops."""
+    """80 of the 300 steps, up to the highest SH degree, have the losses of the reference ops."""
 
     def losses(trainer: Trainer, steps: int) -> torch.Tensor:
         return torch.tensor([trainer.step_once() for _ in range(steps)], dtype=torch.float64)
 
-    config = replace(CALM, sh_interval=25)
+    config = replace(CALM, sh_interval=15)
     trainer = Trainer(dataset, config)
     before = trainer.evaluate()
     native = losses(trainer, 300)
@@ -139,8 +139,8 @@ def test_training_learns_and_has_the_same_losses_in_float64(dataset, monkeypatch
         moments.update({name: moment.double() for name, moment in moments.items()})
     for name in ("project", "rasterize", "photometric_loss", "adam_step"):
         monkeypatch.setattr(ops, name, getattr(reference, name))
-    expected = losses(exact, 130)
-    native = native[:130]
+    expected = losses(exact, 80)
+    native = native[:80]
     torch.testing.assert_close(native[:30], expected[:30], rtol=1e-3, atol=0)
     # Rounding errors grow during training, so only the trend is the same later.
     torch.testing.assert_close(native, expected, rtol=0.1, atol=0)
@@ -194,10 +194,9 @@ def test_a_run_starts_from_given_gaussians_and_does_not_change_them(dataset):
     assert not torch.equal(trainer.gaussians.means, initial.means)
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-def test_an_antialiased_scene(dataset, batch):
+def test_an_antialiased_scene(dataset):
     """It is trained with the filter: without it, the same Gaussians fit the photos less well."""
-    config = replace(CALM, antialias=True, batch=batch, learning_rates=LearningRates().scaled(3.0))
+    config = replace(CALM, antialias=True, batch=2, learning_rates=LearningRates().scaled(3.0))
     small = dataset.points.xyz.repeat(4, 1) + 0.1 * torch.randn(
         4 * COUNT, 3, generator=torch.Generator().manual_seed(3)
     )
