@@ -64,9 +64,8 @@ def test_moved_folders(project, tmp_path, caplog):
 
 
 def test_edited_photos(project, tmp_path, caplog):
-    dataset, out = tmp_path / "dataset", tmp_path / "out"
-    shutil.copytree(project / "dataset", dataset)
-    train(dataset, out, TrainOptions(settings=_longer(2)))
+    copy = shutil.copytree(project, tmp_path / "copy")
+    dataset, out = copy / "dataset", copy / "scene"
     photos = sorted((dataset / "images").iterdir())
     os.utime(photos[1], (1.0, 1.0))
     resume(out, TrainOptions(settings={"iterations": 4}))
