@@ -13,6 +13,8 @@ from snowsplat.pipeline.train import train
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 
+from .test_waiting import Waits
+
 
 def with_floater(gaussians: Gaussians, position: torch.Tensor) -> Gaussians:
     """The Gaussians and a small red one, half transparent."""
@@ -25,17 +27,17 @@ def with_floater(gaussians: Gaussians, position: torch.Tensor) -> Gaussians:
     return gaussians.append(floater)
 
 
-@pytest.fixture
-def photos(dataset, tmp_path):
-    """A copy of the dataset, which a test may move."""
-    return shutil.copytree(dataset, tmp_path / "photos")
+@pytest.fixture(scope="module")
+def photos(dataset, tmp_path_factory):
+    """A copy of the dataset, which a test may move, and move back."""
+    return shutil.copytree(dataset, tmp_path_factory.mktemp("clean") / "photos")
 
 
-@pytest.fixture
-def trained(photos, tmp_path):
+@pytest.fixture(scope="module")
+def trained(photos):
     """An output folder whose scene has a floater before the first held-out camera."""
     options = TrainOptions(hold_out=4, settings={"iterations": 150, "visible_only": False})
-    out = tmp_path / "out"
+    out = photos.with_name("out")
     train(photos, out, options)
     scene = load_trained(out)
     camera = scene.dataset.test[0].camera
@@ -51,8 +53,14 @@ def nearest(path, position: torch.Tensor) -> float:
 
 def test_held_out_photos_decide(trained, tmp_path):
     out, ahead = trained
-    done = clean(out, tmp_path / "clean.ply")
+    seen = Waits()
+    done = clean(out, tmp_path / "clean.ply", observer=seen)
     assert "held-out" in done.compared
+    assert (seen.stages, seen.open) == (["reading", "cleaning"], False)
+    views = seen.counts["views"]
+    assert [count for count, _ in views] == list(range(views[0][1]))
+    for count, total in seen.counts["floaters"]:
+        assert 0 <= count < total
     assert nearest(tmp_path / "clean.ply", ahead) > 0.01
     assert done.after < done.before
     assert done.psnr[1] > done.psnr[0]
@@ -75,6 +83,9 @@ def test_a_scene_file_needs_its_dataset(trained, photos, tmp_path):
 def test_without_photos_the_images_stay(trained, photos, tmp_path):
     out, _ = trained
     photos.rename(tmp_path / "moved")
-    done = clean(out, tmp_path / "clean.ply")
+    try:
+        done = clean(out, tmp_path / "clean.ply")
+    finally:
+        (tmp_path / "moved").rename(photos)
     assert "renderings" in done.compared
     assert done.psnr[1] >= 40.0

@@ -8,13 +8,10 @@ from tests.gaussians import gaussians_in_box
 
 from snowsplat.extras.globe.make_globe import make_globe
 from snowsplat.formats import write_gaussians
-from snowsplat.pipeline.clean import clean
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.scene import Edits
-from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.publish import publish, viewed_scene
-from snowsplat.pipeline.train import train
 
 
 class Waits(Observer):
@@ -60,16 +57,3 @@ def test_stages_of_commands_for_scenes(scene, tmp_path):
         job(seen)
         assert " ".join(seen.stages).startswith(stages)
         assert not seen.open
-
-
-def test_clean_counts_views_and_floaters(dataset, tmp_path):
-    options = TrainOptions(hold_out=8, settings={"iterations": 20, "initial_points": 300})
-    train(dataset, tmp_path / "out", options)
-    seen = Waits()
-    clean(tmp_path / "out", tmp_path / "clean.ply", observer=seen)
-    assert seen.stages == ["reading", "cleaning"]
-    assert not seen.open
-    views = seen.counts["views"]
-    assert [done for done, _ in views] == list(range(views[0][1]))
-    for done, total in seen.counts.get("floaters", []):
-        assert 0 <= done < total
