@@ -151,7 +151,7 @@ def new_flags() -> frozenset[str]:
     return frozenset(
         f"--{name}"
         for page in pages
-        for name in re.findall(r"^\+ +(\w+): \w+ = setting", page, re.M)
+        for name in re.findall(r"^\+ +(\w+): \w+ = (?:flag|setting)", page, re.M)
     )
 
 

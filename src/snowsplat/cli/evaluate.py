@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from snowsplat.cli.command import JsonCommand, next_step, print_message
 from snowsplat.cli.scene_choice import SceneChoice
 from snowsplat.util.messages import message
-from snowsplat.util.settings import group, setting
+from snowsplat.util.settings import flag, group, setting
 
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
@@ -38,10 +38,8 @@ class Evaluate(JsonCommand):
     """
 
     scene: SceneChoice = group(SceneChoice)
-    split: Literal["test", "train"] = setting(
-        "test",
-        "test: the held-out photos; train: the training photos.",
-        metavar="{test,train}",
+    split: Literal["test", "train"] = flag(
+        "test", "test: the held-out photos; train: the training photos."
     )
     lpips: Path | None = setting(
         None,

@@ -24,7 +24,7 @@ from snowsplat.cli.command import print_message
 from snowsplat.util.errors import UserError
 from snowsplat.util.flags import words
 from snowsplat.util.messages import Message, message
-from snowsplat.util.settings import Settings, same, setting, switch
+from snowsplat.util.settings import Settings, flag, same, setting, switch
 from snowsplat.viewer.hosts import LOCAL_HOST
 
 if TYPE_CHECKING:
@@ -118,11 +118,10 @@ def wait() -> None:
 class PageAddress(Settings):
     """The address of a page."""
 
-    port: int | None = setting(
+    port: int | None = flag(
         None,
         "Port of the page. Its URL, which is printed, contains a secret token.",
         "8080, or the next free one",
-        metavar="N",
     )
     host: str | None = setting(
         None,
@@ -163,7 +162,7 @@ class PageServer(Settings):
         "127.0.0.1, this computer only",
         metavar="ADDRESS",
     )
-    port: int = setting(0, "Port to listen on.", "a free one", metavar="N")
+    port: int = flag(0, "Port to listen on.", "a free one")
     allow_host: tuple[str, ...] = same(PageAddress, "allow_host", ())
     no_browser: bool = switch("Print the URL, but do not open a browser.")
 

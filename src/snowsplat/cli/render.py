@@ -12,7 +12,7 @@ from snowsplat.cli.scene_choice import SceneChoice
 from snowsplat.pipeline.options.video import VideoOptions
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
-from snowsplat.util.settings import group, setting, switch
+from snowsplat.util.settings import flag, group, setting, switch
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.render import Split
@@ -44,19 +44,16 @@ class Render(JsonCommand):
     """
 
     scene: SceneChoice = group(SceneChoice)
-    split: Literal["all", "test", "train"] = setting(
-        "all",
-        "test: the held-out photos; train: the training photos; all: both.",
-        metavar="{all,test,train}",
+    split: Literal["all", "test", "train"] = flag(
+        "all", "test: the held-out photos; train: the training photos; all: both."
     )
     skip_train: bool = switch("The same as --split test.")
     skip_test: bool = switch("The same as --split train.")
-    depth: Literal["none", "16bit", "color"] = setting(
+    depth: Literal["none", "16bit", "color"] = flag(
         "none",
         "Also write the depth, to depth/00000.png … 16bit: grey values, whose unit is written to "
         "world_units_per_step.json; color: colours from yellow (near) to violet (far). With "
         "--path, color writes a second video.",
-        metavar="{none,16bit,color}",
     )
     options: VideoOptions = group(VideoOptions)
     video: Path | None = setting(

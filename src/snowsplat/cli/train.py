@@ -19,7 +19,7 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.flags import with_flags
 from snowsplat.util.messages import message
 from snowsplat.util.run_lock import one_run
-from snowsplat.util.settings import argument, group, needed, setting, switch
+from snowsplat.util.settings import argument, flag, group, needed, setting, switch
 
 if TYPE_CHECKING:
     from snowsplat.project.training_folder import DatasetSettings
@@ -73,11 +73,10 @@ class Train(JsonCommand):
     )
     options: TrainOptions = group(TrainOptions)
     white_background: bool = switch("The same as --background white.", "-w")
-    feature_lr: float | None = setting(
+    feature_lr: float | None = flag(
         None,
         "Set --lr-sh-dc to F and --lr-sh-rest to F/20, as in the reference implementation.",
         "set by the recipe",
-        metavar="F",
     )
     view: bool = switch(
         "Show the training in the browser: the scene, curves of loss and PSNR, and a button to "
@@ -89,20 +88,18 @@ class Train(JsonCommand):
         "interruption."
     )
     overwrite: bool = common.overwrite("Replace the results of an earlier training run in OUT.")
-    processes: int | None = setting(
+    processes: int | None = flag(
         None,
         "Distribute the Gaussians over N processes on this computer, which needs less memory per "
         "process. Use it with --batch of N or a multiple of N. With --deterministic or on a CPU, "
         "the result is the same as that of one process.",
         "1",
-        metavar="N",
     )
-    log: tuple[Literal["csv", "tensorboard"], ...] = setting(
+    log: tuple[Literal["csv", "tensorboard"], ...] = flag(
         (),
         "Also write loss, number of Gaussians and metrics of the steps: csv: to OUT/log.csv; "
         "tensorboard: to OUT/tensorboard, which needs the package snowsplat[tensorboard].",
         "none",
-        metavar="[{csv,tensorboard} ...]",
     )
     quiet: bool = common.quiet()
 

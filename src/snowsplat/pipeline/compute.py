@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from snowsplat.pipeline.run import processes
-from snowsplat.util.settings import Settings, setting, switch
+from snowsplat.util.settings import Settings, flag, setting, switch
 
 if TYPE_CHECKING:
     import torch
@@ -48,12 +48,11 @@ class Compute(Settings):
         allowed="cpu, cuda or cuda:1",
         check=lambda device: None if _DEVICE.fullmatch(device) else "is unknown",
     )
-    threads: int | None = setting(
+    threads: int | None = flag(
         None,
         "Number of CPU threads. The result does not depend on this number.",
         "all cores",
         least=1,
-        metavar="N",
     )
     deterministic: bool = switch(
         "On a GPU, make the results of repeated runs bit-identical. This needs more time and "

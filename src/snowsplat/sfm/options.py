@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from snowsplat.scene.length import metres_of
-from snowsplat.util.settings import Settings, group, setting, switch
+from snowsplat.util.settings import Settings, flag, group, setting, switch
 
 Mapper = Literal["incremental", "global"]
 EffortName = Literal["draft", "normal", "best"]
@@ -26,21 +26,19 @@ class GatherOptions(Settings):
         as_stored: photos in place keep their pixels as stored, because a model of these exists.
     """
 
-    fps: float | None = setting(
+    fps: float | None = flag(
         None,
         "Number of frames to use per second of video.",
         "2.5; lower for long videos",
         above=0.0,
         allowed="a number above 0, e.g. 2",
-        metavar="F",
     )
-    frames: int | None = setting(
+    frames: int | None = flag(
         None,
         "Number of frames to use per video.",
         "determined by --fps",
         least=MIN_PHOTOS,
         allowed=f"{MIN_PHOTOS} or more, e.g. 60",
-        metavar="N",
     )
     size: int | None = setting(
         None,
@@ -67,10 +65,9 @@ class SfmOptions(Settings):
             is always a first attempt, and further ones until poses are found.
     """
 
-    effort: EffortName = setting(
+    effort: EffortName = flag(
         "normal",
         "Effort to detect and match features. best takes several times as long as normal.",
-        metavar="{draft,normal,best}",
         name="quality",
     )
     camera_model: str = setting(
@@ -82,13 +79,12 @@ class SfmOptions(Settings):
         metavar="MODEL",
         aliases=("--camera",),
     )
-    mapper: Mapper = setting(
+    mapper: Mapper = flag(
         "incremental",
         "incremental: estimate the camera poses one after the other; global: estimate all poses at "
         "once, which is faster for many photos.",
-        metavar="{incremental,global}",
     )
-    threads: int | None = setting(None, "Number of CPU threads.", "all cores", least=1, metavar="N")
+    threads: int | None = flag(None, "Number of CPU threads.", "all cores", least=1)
     seconds: float | None = None
 
 
@@ -116,7 +112,6 @@ class DatasetOptions(Settings):
         "10cm, 4in: one unit of the scene is then one metre. Markers that lie flat also tell up.",
         "none",
         above=0.0,
-        allowed="a number above 0",
         parse=metres_of,
         metavar="LENGTH",
     )

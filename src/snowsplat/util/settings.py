@@ -2,7 +2,7 @@
 
     @dataclass(frozen=True)
     class Sharpening(Settings):
-        strength: float = setting(0.5, "Weight of the sharpness.", least=0.0, metavar="F")
+        strength: float = flag(0.5, "Weight of the sharpness.", least=0.0)
 
 `Settings` checks the values when the object is created. The arguments and flags of the command line
 (`snowsplat.util.flags`), their help texts, the values in files (`--config`) and the table in the
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from functools import cache
 from numbers import Integral, Real
@@ -31,6 +31,9 @@ When = int | float
 
 #: Larger whole numbers do not fit into the 64 bits of tensors and kernels.
 _LARGEST = 2**63 - 1
+# Of `flag`: the placeholder says the type, which is known with the class.
+_OF_TYPE = "TYPE"
+_PLACEHOLDERS: dict[Any, str] = {bool: "{on,off}", int: "N", float: "F", str: "TEXT"}
 _Value = TypeVar("_Value")
 
 
@@ -84,6 +87,11 @@ def setting(value: _Value, help: str, flag: str | None = None, **declared: Any) 
     """
     metadata = {"setting": Setting(help, default=flag, **declared)}
     return field(default=value, metadata=metadata)
+
+
+def flag(value: _Value, help: str, default: str | None = None, **declared: Any) -> _Value:
+    """A field that is a flag, too; its placeholder is that of its type: N, F, TEXT, {on,off} …"""
+    return setting(value, help, default, metavar=_OF_TYPE, **declared)
 
 
 def part(kind: Callable[[], _Value], help: str, **declared: Any) -> _Value:
@@ -160,10 +168,25 @@ class Settings:
 def declarations(kind: type) -> tuple[tuple[str, Any, Setting], ...]:
     """Name, type and declaration of the fields of a class. A plain field declares only its type."""
     hints = get_type_hints(kind)
-    return tuple(
-        (each.name, hints[each.name], each.metadata.get("setting", _UNDECLARED))
-        for each in fields(kind)
-    )
+    found = []
+    for each in fields(kind):
+        hint, declared = hints[each.name], each.metadata.get("setting", _UNDECLARED)
+        if declared.metavar == _OF_TYPE:
+            declared = replace(declared, metavar=_placeholder(hint))
+        found.append((each.name, hint, declared))
+    return tuple(found)
+
+
+def _placeholder(hint: Any) -> str:
+    """That of a value: "{auto,on,off}" of the words of a `Literal`, "[N ...]" of a tuple."""
+    kinds = get_args(hint)
+    if get_origin(hint) is Literal:
+        return f"{{{','.join(kinds)}}}"
+    if get_origin(hint) is tuple:
+        return f"[{_placeholder(kinds[0])} ...]"
+    if not kinds:
+        return _PLACEHOLDERS[hint]
+    return "|".join(_placeholder(kind) for kind in kinds if kind is not NoneType)
 
 
 def checked(name: str, value: Any, hint: Any, declared: Setting = _UNDECLARED) -> Any:

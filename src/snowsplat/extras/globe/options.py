@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from snowsplat.pipeline.options.video import VideoSize
-from snowsplat.util.settings import Settings, setting
+from snowsplat.util.settings import Settings, flag, setting
 
 _LARGEST = 1_000_000  # Gaussians: the page has 26 bytes for each
 LONGEST_NAME = 60
@@ -22,21 +22,16 @@ def _long(name: str) -> str | None:
 class GlobeOptions(Settings):
     """Options of a globe. Raises: UserError: a value is out of range."""
 
-    gaussians: int = setting(
+    gaussians: int = flag(
         100_000,
         "Maximum number of Gaussians. The most important ones are used.",
         least=1,
         most=_LARGEST,
         allowed=f"1 to {_LARGEST:,}",
-        metavar="N",
         aliases=("-n",),
     )
-    name: str | None = setting(
-        None,
-        "Text on the plate of the base.",
-        "the name of the scene",
-        check=_long,
-        metavar="TEXT",
+    name: str | None = flag(
+        None, "Text on the plate of the base.", "the name of the scene", check=_long
     )
     size: str | None = setting(
         None,
@@ -44,13 +39,8 @@ class GlobeOptions(Settings):
         "960x960",
         metavar="WxH|W",
     )
-    fps: float = setting(
-        30.0,
-        "Frames per second of the video.",
-        least=1.0,
-        most=120.0,
-        allowed="1 to 120",
-        metavar="F",
+    fps: float = flag(
+        30.0, "Frames per second of the video.", least=1.0, most=120.0, allowed="1 to 120"
     )
 
     def __post_init__(self) -> None:

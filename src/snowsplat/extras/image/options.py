@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from snowsplat.util.settings import Settings, setting
+from snowsplat.util.settings import Settings, flag, setting
 
 #: "additive": the image is background + Σ w c, in which the order has no effect and colours may be
 #: negative (Zhang et al. 2024, GaussianImage, arXiv:2403.08551). "front-to-back": the Gaussians are
@@ -27,13 +27,12 @@ class FitOptions(Settings):
         UserError: a value is out of range.
     """
 
-    gaussians: int = setting(
+    gaussians: int = flag(
         1000,
         "Number of Gaussians.",
         least=1,
         most=MOST_GAUSSIANS,
         allowed=f"1 to {MOST_GAUSSIANS}",
-        metavar="N",
         aliases=("-n",),
     )
     blending: Blending = setting(
@@ -42,10 +41,7 @@ class FitOptions(Settings):
         "of the Gaussians, without SVG.",
         metavar="{front-to-back,additive}",
     )
-    steps: int = setting(
-        3000,
-        "Number of steps of the optimiser. More steps give a better image.",
-        least=1,
-        metavar="N",
+    steps: int = flag(
+        3000, "Number of steps of the optimiser. More steps give a better image.", least=1
     )
-    seed: int = setting(0, "Seed of the random positions of the Gaussians.", "0", metavar="N")
+    seed: int = flag(0, "Seed of the random positions of the Gaussians.", "0")

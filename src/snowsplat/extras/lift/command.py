@@ -14,7 +14,7 @@ from snowsplat.pipeline.options import common
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
-from snowsplat.util.settings import group, needed, setting, switch
+from snowsplat.util.settings import flag, group, needed, setting, switch
 
 _NEEDED = message(
     "lift needs a photo and an output folder: snowsplat lift PHOTO --depth MAP -o OUT"
@@ -62,7 +62,7 @@ class Lift(JsonCommand):
         "points, and the scene is trained on all of its photos.",
         metavar="DATASET",
     )
-    iterations: int = setting(1000, "Number of training steps with --refine.", metavar="N")
+    iterations: int = flag(1000, "Number of training steps with --refine.")
     eval: bool = switch(
         "With --refine: hold out every 8th photo, and evaluate the scene on these photos."
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from snowsplat.util.errors import UserError
-from snowsplat.util.settings import Settings, setting
+from snowsplat.util.settings import Settings, flag, setting
 
 DepthKind = Literal["z", "distance", "disparity"]
 #: The largest difference of the depths of linked neighbours, relative to the larger depth.
@@ -22,20 +22,18 @@ class LiftOptions(Settings):
         SettingError: a value is not positive.
     """
 
-    max_gaussians: int | None = setting(
+    max_gaussians: int | None = flag(
         None,
         "Merge the pixels of uniform parts, until there are at most this many Gaussians.",
         "one per pixel",
         least=1,
-        metavar="N",
     )
-    edge: float = setting(
+    edge: float = flag(
         EDGE_THRESHOLD,
         "Neighbouring pixels are on different surfaces if their depths differ by more than this "
         "share.",
         above=0.0,
         allowed="a positive share, e.g. 0.05",
-        metavar="F",
     )
 
 
@@ -61,22 +59,20 @@ class DepthSource(Settings):
         "library transformers; for example, Depth Anything V2.",
         metavar="PATH",
     )
-    kind: DepthKind | None = setting(
+    kind: DepthKind | None = flag(
         None,
         "What the values are. z: the distance along the optical axis; distance: along the ray; "
         "disparity: inverse depth, known up to a factor.",
         "z; disparity for a model",
         name="depth_is",
-        metavar="{z,distance,disparity}",
     )
-    near: float | None = setting(
+    near: float | None = flag(
         None,
         "Depth of the nearest pixel. Together with --far, sets the range of the depths of a map "
         "without units.",
         "from the map",
-        metavar="F",
     )
-    far: float | None = setting(None, "Depth of the farthest pixel.", "from the map", metavar="F")
+    far: float | None = flag(None, "Depth of the farthest pixel.", "from the map")
 
     def __post_init__(self) -> None:
         super().__post_init__()

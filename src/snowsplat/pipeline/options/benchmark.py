@@ -11,7 +11,7 @@ from snowsplat.pipeline.options import common
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.density import DENSITY_CONTROLS
 from snowsplat.training.settings.recipes import recipe
-from snowsplat.util.settings import Settings, by_name, setting
+from snowsplat.util.settings import Settings, by_name, flag, setting
 
 SuiteName = Literal["mipnerf360", "tandt", "db", "blender", "custom"]
 #: More blocks than this are a mistake.
@@ -31,12 +31,7 @@ class BenchmarkOptions(Settings):
         UserError: an unknown suite, or fewer than 1 job.
     """
 
-    suite: SuiteName | None = setting(
-        None,
-        "The benchmark suite.",
-        "by the names of the scenes",
-        metavar="{mipnerf360,tandt,db,blender,custom}",
-    )
+    suite: SuiteName | None = flag(None, "The benchmark suite.", "by the names of the scenes")
     scenes: tuple[str, ...] = setting((), "Only these scenes.", "all", metavar="[NAME ...]")
     recipe: str = common.recipe("default", "The recipe of the training.")
     settings: Mapping[str, Any] = by_name(
@@ -49,15 +44,12 @@ class BenchmarkOptions(Settings):
         "not measured",
         metavar="{vgg,alex,FILE}",
     )
-    jobs: int = setting(
+    jobs: int = flag(
         1,
         "Number of scenes trained at the same time. They share the CPU; job i uses GPU i.",
         least=1,
-        metavar="N",
     )
-    device: Literal["cpu", "cuda"] | None = setting(
-        None, "Device for the training.", "a GPU", metavar="{cpu,cuda}"
-    )
+    device: Literal["cpu", "cuda"] | None = flag(None, "Device for the training.", "a GPU")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -78,14 +70,13 @@ class PlanOptions(Settings):
         UserError: a value out of its range.
     """
 
-    blocks: int = setting(4, "Number of blocks.", least=1, most=MOST_BLOCKS, metavar="N")
-    margin: float = setting(
+    blocks: int = flag(4, "Number of blocks.", least=1, most=MOST_BLOCKS)
+    margin: float = flag(
         0.2,
         "A block is trained with the photos and points of its cell, expanded on each side by this "
         "share of its size.",
         least=0.0,
         most=10.0,
-        metavar="F",
     )
     recipe: str = common.recipe("default", "The recipe of the training, see snowsplat train.")
     settings: Mapping[str, Any] = by_name(

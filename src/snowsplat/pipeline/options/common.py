@@ -8,19 +8,17 @@ from typing import Any
 
 from snowsplat.training.settings.recipes import RECIPES, check_recipe
 from snowsplat.util.byte_size import parse_bytes
-from snowsplat.util.settings import setting, switch
+from snowsplat.util.settings import flag, setting, switch
 
 
 def minutes(help: str) -> float | None:
     """A duration in minutes; None: any."""
-    return setting(
+    return flag(
         None,
         help,
         "none",
         above=0.0,
-        allowed="a number above 0",
         check=lambda given: None if math.isfinite(60.0 * given) else "is not a duration",
-        metavar="F",
     )
 
 
@@ -55,14 +53,13 @@ def images() -> str | None:
 
 def resolution(otherwise: str) -> int | None:
     """A divisor of the size of the photos, or their width; None or -1: unchanged."""
-    return setting(
+    return flag(
         None,
         "With 1, 2, 4 or 8, the width and height of the photos are divided by this number. Any "
         "other number is the new width in pixels.",
         otherwise,
         allowed="1, 2, 4, 8 or a width",
         check=lambda number: None if number == -1 or number >= 1 else "is not valid",
-        metavar="N",
         aliases=("-r",),
     )
 
@@ -95,7 +92,7 @@ def recipe(value: Any, help: str) -> Any:
 def iteration() -> int | None:
     """The step of the scene; None: the last one."""
     help = "If OUT contains several scenes, the step after which the scene was saved."
-    return setting(None, help, "the last step", metavar="N")
+    return flag(None, help, "the last step")
 
 
 def overwrite(help: str = "Replace FILE if it exists already.") -> bool:

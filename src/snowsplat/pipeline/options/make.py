@@ -9,7 +9,7 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
 from snowsplat.sfm.options import DatasetOptions
 from snowsplat.training.settings.config import AutoOnOff, TrainConfig
-from snowsplat.util.settings import Settings, group, same, setting
+from snowsplat.util.settings import Settings, flag, group, same, setting
 
 Quality = Literal["draft", "normal", "best"]
 
@@ -35,13 +35,12 @@ class MakeOptions(Settings):
         SettingError: a value is invalid.
     """
 
-    quality: Quality | None = setting(
+    quality: Quality | None = flag(
         None,
         "draft: a quick preview; best: takes several times as long as normal. With `minutes`, the "
         "quality determines only the effort to estimate the camera poses; the training uses the "
         "remaining time.",
         "normal; with --minutes, chosen for this time",
-        metavar="{draft,normal,best}",
     )
     minutes: float | None = common.minutes(
         "Finish within this time. If there are too many photos for this time, some of them are "
@@ -58,11 +57,8 @@ class MakeOptions(Settings):
         parse=_every,
         metavar="{none,N}",
     )
-    title: str | None = setting(
-        None,
-        "The name of the scene in its report and on its pages.",
-        "the name of the input",
-        metavar="TEXT",
+    title: str | None = flag(
+        None, "The name of the scene in its report and on its pages.", "the name of the input"
     )
     exposure: AutoOnOff = same(TrainConfig, "exposure", "auto")
     marker: float | None = same(DatasetOptions, "marker", None)

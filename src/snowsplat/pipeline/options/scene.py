@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from snowsplat.util.errors import SettingError
-from snowsplat.util.settings import Settings, setting, switch
+from snowsplat.util.settings import Settings, flag, setting, switch
 
 Vector = tuple[float, float, float]
 Box = tuple[float, float, float, float, float, float]
@@ -50,14 +50,13 @@ class Edits(Settings):
         UserError: a value out of its range.
     """
 
-    sh_degree: int | None = setting(
+    sh_degree: int | None = flag(
         None,
         "Reduce the spherical harmonics (view-dependent colour) to this degree, 0 to 3.",
         "that of the scene",
         least=0,
         most=3,
         allowed="0 to 3",
-        metavar="N",
     )
     crop: Box | None = setting(
         None,
@@ -77,13 +76,7 @@ class Edits(Settings):
         "Rotate by these angles in degrees, first about x, then about y, then about z.",
         metavar="X Y Z",
     )
-    scale: float = setting(
-        1.0,
-        "Scale by this factor about the origin.",
-        above=0.0,
-        allowed="a number above 0",
-        metavar="F",
-    )
+    scale: float = flag(1.0, "Scale by this factor about the origin.", above=0.0)
     translate: Vector = setting((0.0, 0.0, 0.0), "Translate by this offset.", metavar="X Y Z")
 
     def __post_init__(self) -> None:
@@ -97,8 +90,7 @@ class Edits(Settings):
 
 
 def _length(help: str, default: str) -> float | None:
-    allowed = "a number above 0"
-    return setting(None, help, default, above=0.0, allowed=allowed, metavar="LENGTH")
+    return setting(None, help, default, above=0.0, metavar="LENGTH")
 
 
 def _installed(triangles: int) -> str | None:
@@ -128,13 +120,12 @@ class MeshOptions(Settings):
         most=1.0,
         metavar="SHARE",
     )
-    triangles: int | None = setting(
+    triangles: int | None = flag(
         None,
         "Simplify the mesh to about this number: 5000 for collisions in a game.",
         "all",
         least=4,
         check=_installed,
-        metavar="N",
     )
     fill_holes: bool = switch("Close holes with flat triangles, as 3D printing needs it.")
     gaussians_only: bool = switch("Do not compare the photos: for photos that are renders.")
@@ -159,10 +150,8 @@ class PublishOptions(Settings):
         UserError: the address is not one.
     """
 
-    title: str | None = setting(
-        None, "The name of the scene on the page.", "the name of the scene", metavar="TEXT"
-    )
-    licence: str = setting("", "The licence of the scene.", "not stated", metavar="TEXT")
+    title: str | None = flag(None, "The name of the scene on the page.", "the name of the scene")
+    licence: str = flag("", "The licence of the scene.", "not stated")
     url: str = setting(
         "",
         "The address of the folder on the web, for the picture in previews of links.",

@@ -15,7 +15,7 @@ from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.rates import DecayRates, LearningRates
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import UserError
-from snowsplat.util.settings import Settings, by_name, group, setting, switch
+from snowsplat.util.settings import Settings, by_name, flag, group, setting, switch
 
 if TYPE_CHECKING:
     from snowsplat.project.training_folder import DatasetSettings
@@ -71,11 +71,8 @@ class TrainOptions(Settings):
         "impossible lens."
     )
     compute: Compute = group(Compute)
-    save_iterations: tuple[int, ...] = setting(
-        (),
-        "Steps after which to save the scene, in addition to the last step.",
-        least=-1,
-        metavar="[N ...]",
+    save_iterations: tuple[int, ...] = flag(
+        (), "Steps after which to save the scene, in addition to the last step.", least=-1
     )
     checkpoint_seconds: float | None = setting(None, "Time between checkpoints.", least=0.0)
 

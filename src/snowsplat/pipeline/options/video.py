@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from snowsplat.util.errors import SettingError
-from snowsplat.util.settings import Settings, setting, switch
+from snowsplat.util.settings import Settings, flag, setting, switch
 
 if TYPE_CHECKING:
     from snowsplat.scene.camera import Camera
@@ -91,19 +91,17 @@ class VideoOptions(Settings):
         UserError: an unusable length, rate or size.
     """
 
-    antialias: bool | None = setting(
+    antialias: bool | None = flag(
         None,
         "Whether to render for the size of the pixels, as scenes trained with --antialias on are "
         "rendered. Use it if a scene file from another program lacks this mark.",
         "as trained",
-        metavar="{on,off}",
     )
-    projection: Projection = setting(
+    projection: Projection = flag(
         "pinhole",
         "equirectangular: 360° pictures of all directions, level, from the places of the photos or "
         "along --path: images to OUT/SPLIT/ours_N/panoramas, or a 360° video; --size is their "
         "width.",
-        metavar="{pinhole,equirectangular}",
     )
     path: str = setting(
         "ellipse",
@@ -115,12 +113,8 @@ class VideoOptions(Settings):
         "render images",
         metavar="{training,ellipse,spiral,FILE}",
     )
-    seconds: float = setting(
-        10.0, "Length of the video in seconds.", above=0.0, metavar="F", allowed="a number above 0"
-    )
-    fps: float = setting(
-        30.0, "Frames per second of the video.", above=0.0, metavar="F", allowed="a number above 0"
-    )
+    seconds: float = flag(10.0, "Length of the video in seconds.", above=0.0)
+    fps: float = flag(30.0, "Frames per second of the video.", above=0.0)
     ease: bool = switch("Begin and end slowly; for a path through the cameras of a file.")
     size: str | None = setting(
         None,

@@ -11,7 +11,7 @@ from snowsplat.training.settings.rates import DecayRates, LearningRates
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.starts import check_starts
 from snowsplat.util.errors import SettingError
-from snowsplat.util.settings import Settings, When, part, setting
+from snowsplat.util.settings import Settings, When, flag, part, setting
 
 #: Whether a part takes part: always, never, or if the photos show that it is needed.
 AutoOnOff = Literal["auto", "on", "off"]
@@ -39,27 +39,20 @@ class TrainConfig(Settings):
         SettingError: a value is invalid, or two settings contradict each other.
     """
 
-    iterations: int = setting(
-        30_000, "Number of training steps; each uses one photo.", least=1, metavar="N"
-    )
+    iterations: int = flag(30_000, "Number of training steps; each uses one photo.", least=1)
     # The gradient of an update is the mean over the views of the batch, and Adam's β₁ and β₂ are
     # raised to the power batch (Zhao et al. 2024, arXiv:2406.18533).
-    batch: int = setting(
+    batch: int = flag(
         1,
         "Number of photos per update of the Gaussians. All other settings still count photos; the "
         "learning rates are multiplied by the square root of N.",
         "1",
         least=1,
-        metavar="N",
     )
-    checkpoint_every: int = setting(
-        0,
-        "Save a checkpoint every N steps. `resume` can continue from it.",
-        "none",
-        least=0,
-        metavar="N",
+    checkpoint_every: int = flag(
+        0, "Save a checkpoint every N steps. `resume` can continue from it.", "none", least=0
     )
-    seed: int = setting(
+    seed: int = flag(
         0,
         "Seed of all random choices. On the CPU, the same seed produces a bit-identical scene; on "
         "a GPU, this requires `deterministic`.",
@@ -67,44 +60,38 @@ class TrainConfig(Settings):
         least=-_SEED_LIMIT,
         most=_SEED_LIMIT - 1,
         allowed="a whole number closer to 0 than 2**61",
-        metavar="N",
     )
-    test_iterations: tuple[int, ...] = setting(
+    test_iterations: tuple[int, ...] = flag(
         (7_000, 30_000),
         "Steps after which to evaluate the scene on the held-out photos, in addition to the last "
         "step; -1: only after the last step.",
         least=-1,
-        metavar="[N ...]",
     )
-    background: Literal["black", "white", "random"] = setting(
+    background: Literal["black", "white", "random"] = flag(
         "black",
         "Colour of the background of the scene and of transparent photos; random: a new colour in "
         "each step, which prevents fog before a transparent background.",
         "black",
-        metavar="{black,white,random}",
     )
-    leave_out_after: When = setting(
+    leave_out_after: When = flag(
         0,
         "After this step, leave out the training photos that the scene does not explain: their "
         "camera poses are probably wrong. A value with a decimal point (0.15) is a fraction of all "
         "steps; 0: never.",
         "0",
         least=0,
-        metavar="N|F",
     )
-    transients: AutoOnOff = setting(
+    transients: AutoOnOff = flag(
         "off",
         "Whether to mask what moves, such as people who walk past: it looks different from what "
         "the other photos show at this place. auto: if there are at least 30 photos and something "
         "moves in several of them; on: in any of at least 8 photos, and add Gaussians only after "
         "the first masks are known.",
-        metavar="{auto,on,off}",
     )
-    exposure: AutoOnOff = setting(
+    exposure: AutoOnOff = flag(
         "off",
         "Whether to learn a gain for each photo and colour channel, for photos with different "
         "exposures or white balances. auto: if the photos differ by at least 0.05 EV.",
-        metavar="{auto,on,off}",
     )
     refine_poses: bool = setting(
         False,
@@ -113,12 +100,11 @@ class TrainConfig(Settings):
         "OUT/refined/sparse/0.",
         metavar="",
     )
-    antialias: bool = setting(
+    antialias: bool = flag(
         False,
         "Whether to train a scene that also looks right in images that are smaller or larger than "
         "the photos. The scene file is marked. off: for viewers that draw as the reference "
         "implementation does, in images of the size of the photos.",
-        metavar="{on,off}",
     )
     sh_degree: int = setting(
         3,
@@ -136,45 +122,40 @@ class TrainConfig(Settings):
         "`sh_degree` from the first step.",
         least=0,
     )
-    ssim_weight: float = setting(
+    ssim_weight: float = flag(
         0.2,
         "Weight of 1 - SSIM in the loss. The mean absolute difference has the weight 1 - F.",
         least=0.0,
         most=1.0,
-        metavar="F",
         aliases=("--lambda-dssim",),
     )
-    huber_weight: float = setting(
+    huber_weight: float = flag(
         0.0,
         "Weight of a term of the loss that is the squared difference up to 0.1, and linear beyond; "
         "in the last 30% of the steps. It decreases the largest differences, which the PSNR counts "
         "most.",
         least=0.0,
-        metavar="F",
     )
     huber_from: When = setting(0.7, "First moment of `huber_weight`.", least=0)
-    beta1: float = setting(
+    beta1: float = flag(
         0.9,
         "Decay rate of Adam's mean of gradients, for a step with one view. Each step has another "
         "view, so with a smaller rate, fewer views share a step.",
         least=0.0,
         below=1.0,
-        metavar="F",
     )
-    depth_weight: float = setting(
+    depth_weight: float = flag(
         0.0,
         "Weight of the depth maps (depths/IMG.png) and normal maps (normals/IMG.png) of the "
         "dataset in the loss; 0: they are not used. Depths have any unit, normals are in the frame "
         "of the camera. A map that contradicts the points or the photos is left out.",
         "0",
         least=0.0,
-        metavar="F",
     )
-    surfaces: bool = setting(
+    surfaces: bool = flag(
         False,
         "Whether to train flat Gaussians that lie in the surfaces, for meshes and depths. The "
         "training takes about 1.3 times as long.",
-        metavar="{on,off}",
     )
     init: str = setting(
         "points",
@@ -185,13 +166,12 @@ class TrainConfig(Settings):
         check=check_starts,
         metavar="START[+START…]",
     )
-    initial_points: int | float = setting(
+    initial_points: int | float = flag(
         100_000,
         "Number of points of each start except points, which uses all. A value with a decimal "
         "point (0.4) is a share of the maximum number of Gaussians.",
         above=0,
         allowed="a number such as 20000, or a share of the limit of Gaussians such as 0.4",
-        metavar="N|F",
     )
     sweep_side: int = setting(
         640,
@@ -207,18 +187,16 @@ class TrainConfig(Settings):
         "nearest neighbours.",
         above=0.0,
     )
-    sky: bool = setting(
+    sky: bool = flag(
         False,
         "Whether to start with Gaussians far behind the scene if the photos show the sky, and with "
         "none before it. The dataset needs points.",
-        metavar="{on,off}",
     )
-    sky_distance: float = setting(
+    sky_distance: float = flag(
         0.0,
         "Distance of these Gaussians from the middle of the cameras, in units of the scene.",
         "100 x the size of the path",
         least=0.0,
-        metavar="F",
     )
     density: DensityConfig = part(
         AdaptiveDensity, "Settings of density control.", check=check_density

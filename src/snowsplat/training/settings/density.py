@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from snowsplat.util.settings import Settings, When, checked, declarations, same, setting
+from snowsplat.util.settings import Settings, When, checked, declarations, flag, same, setting
 
 _Kind = TypeVar("_Kind", bound=type)
 
@@ -56,67 +56,59 @@ class DensityConfig(Protocol):
 class AdaptiveDensity(Settings):
     """Adaptive density control; the defaults are those of the paper. See `density.adaptive`."""
 
-    max_gaussians: int = setting(
+    max_gaussians: int = flag(
         0,
         "Maximum number of Gaussians, which determines memory and time; 0: no limit. If it would "
         "be exceeded, only the Gaussians with the largest gradients are densified.",
         least=0,
-        metavar="N",
     )
     # Gradients of opposite directions cancel in the sum of the paper, so a large Gaussian in a
     # detailed region is not split; see AbsGS (Ye et al. 2024). Sums of absolute values over pixels,
     # as in AbsGS, are larger and need a larger threshold; sums over tiles do not.
-    grad_threshold: float = setting(
+    grad_threshold: float = flag(
         2e-4,
         "Clone or split Gaussians whose view-space gradient exceeds this threshold. With a larger "
         "value, fewer Gaussians are added.",
         least=0.0,
-        metavar="F",
         aliases=("--densify-grad-threshold",),
     )
-    abs_grad: bool = setting(
+    abs_grad: bool = flag(
         False,
         "Whether `grad_threshold` applies to the sum of the absolute gradients of the 16x16 tiles "
         "of the image. In this sum, gradients of opposite directions do not cancel, so more "
         "Gaussians are cloned or split in detailed regions.",
-        metavar="{on,off}",
     )
-    densify_interval: int = setting(
+    densify_interval: int = flag(
         100,
         "Number of steps between densifications. With a larger value, fewer Gaussians are added.",
         least=1,
-        metavar="N",
         aliases=("--densification-interval",),
     )
-    densify_from: When = setting(
+    densify_from: When = flag(
         500,
         "First step of densification. A value with a decimal point (0.1) is a fraction of all "
         "steps.",
         least=0,
-        metavar="N|F",
         aliases=("--densify-from-iter",),
     )
-    densify_until: When = setting(
+    densify_until: When = flag(
         15_000,
         "Last step of densification. A value with a decimal point (0.5) is a fraction of all "
         "steps.",
         least=0,
-        metavar="N|F",
         aliases=("--densify-until-iter",),
     )
-    opacity_reset_interval: int = setting(
+    opacity_reset_interval: int = flag(
         3000,
         "Number of steps between opacity resets; 0: no resets. The last one is at least 500 steps "
         "before densification ends.",
         least=0,
-        metavar="N",
     )
-    percent_dense: float = setting(
+    percent_dense: float = flag(
         0.01,
         "Densification clones Gaussians smaller than this fraction of the scene extent, and splits "
         "larger ones.",
         least=0.0,
-        metavar="F",
     )
     prune_opacity: float = setting(
         0.005, "Gaussians with a lower opacity are removed.", least=0.0, below=1.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from snowsplat.training.settings.schedule import Schedule
-from snowsplat.util.settings import Settings, When, setting
+from snowsplat.util.settings import Settings, When, flag, setting
 
 # The factor of the rate of the view-dependent colours with few passes over the photos, as measured:
 # see "few passes" in docs/performance.md.
@@ -28,55 +28,50 @@ class LearningRates(Settings):
     prefix: ClassVar[str] = "lr_"
 
     # The schedule interpolates the logarithms of these two rates.
-    means: float = setting(
+    means: float = flag(
         1.6e-4,
         "Learning rate of the positions at the first step, in units of the scene extent.",
         above=0.0,
         allowed="a number above 0, e.g. 1e-12",
-        metavar="F",
         aliases=("--position-lr-init",),
     )
-    means_final: float = setting(
+    means_final: float = flag(
         1.6e-6,
         "Learning rate of the positions from step `lr_means_steps` on, in the same units.",
         above=0.0,
         allowed="a number above 0, e.g. 1e-12",
-        metavar="F",
         aliases=("--position-lr-final",),
     )
-    means_steps: When = setting(
+    means_steps: When = flag(
         30_000,
         "Step at which the learning rate of the positions reaches its final value. A value with a "
         "decimal point (1.0) is a fraction of all steps.",
         least=0,
         largest_fraction=math.inf,
-        metavar="N|F",
         aliases=("--position-lr-max-steps",),
     )
-    log_scales: float = setting(
-        5e-3, "Learning rate of the scales.", least=0.0, metavar="F", aliases=("--scaling-lr",)
+    log_scales: float = flag(
+        5e-3, "Learning rate of the scales.", least=0.0, aliases=("--scaling-lr",)
     )
-    quats: float = setting(
-        1e-3, "Learning rate of the rotations.", least=0.0, metavar="F", aliases=("--rotation-lr",)
+    quats: float = flag(
+        1e-3, "Learning rate of the rotations.", least=0.0, aliases=("--rotation-lr",)
     )
-    opacity_logits: float = setting(
-        0.05, "Learning rate of the opacities.", least=0.0, metavar="F", aliases=("--opacity-lr",)
+    opacity_logits: float = flag(
+        0.05, "Learning rate of the opacities.", least=0.0, aliases=("--opacity-lr",)
     )
-    sh_dc: float = setting(2.5e-3, "Learning rate of the base colours.", least=0.0, metavar="F")
-    sh_rest: float = setting(
+    sh_dc: float = flag(2.5e-3, "Learning rate of the base colours.", least=0.0)
+    sh_rest: float = flag(
         2.5e-3 / 20,
         "Learning rate of the view-dependent colours; if it is set, `lr_sh_rest_passes` is 0 "
         "unless it is set, too.",
         least=0.0,
-        metavar="F",
     )
-    sh_rest_passes: float = setting(
+    sh_rest_passes: float = flag(
         0.0,
         "With fewer passes over the photos than this, the rate of the view-dependent colours is "
         "higher by the power 1.5 of the ratio, at most six times: a colour can change as much in "
         "total, and reaches its value earlier; 0: never.",
         least=0.0,
-        metavar="F",
     )
     anneal: float = setting(
         1.0,
