@@ -17,6 +17,7 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from functools import reduce
 from itertools import takewhile
+from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
@@ -25,47 +26,13 @@ from snowsplat.cli.subcommands import SUBCOMMANDS
 from snowsplat.training.settings.recipes import RECIPES
 from snowsplat.util.flags import flags_of
 from snowsplat.util.messages import Message, message
-from snowsplat.util.safe_json import printable
+from snowsplat.util.safe_json import printable, read_json
 from snowsplat.util.settings import allowed, kinds_of, shown, suggestion
 
 _FLAG = re.compile(r"-[^\d.]")
 _FRAME = "│|╭╮╰╯─┌┐└┘+-= "
 # The flag to use -> flags of the others, without the group before a dot.
-_FLAGS = {
-    "-o": "result-dir output-dir output-path experiment-name",
-    "-r": "data-factor downscale-factor camera-res-scale-factor",
-    "--iterations": "max-steps max-num-iterations steps max-iterations num-iterations",
-    "--quality": "iterations preset",  # of make, where there is no --iterations
-    "--device": "gpu gpus cuda cpu",
-    "--max-gaussians": "cap-max max-gs-num",
-    "--eval": "test-every eval-mode eval-interval train-split-fraction",
-    "--test-iterations": "eval-steps steps-per-eval-all-images",
-    "--save-iterations": "save-steps ply-steps",
-    "--checkpoint-every": "steps-per-save",
-    "--resume": "load-dir load-checkpoint",
-    "--batch": "batch-size",
-    "--refine-poses": "pose-opt camera-optimizer",
-    "--exposure": "app-opt use-bilateral-grid use-bilagrid post-processing",
-    "--antialias": "rasterize-mode",
-    "--background": "random-bkgd background-color",
-    "--init": "init-type random-init",
-    "--view": "vis viewer",
-    "--ssim-weight": "ssim-lambda",
-    "--grad-threshold": "grow-grad2d densify-grad-thresh",
-    "--abs-grad": "absgrad use-absgrad",
-    "--densify-from": "refine-start-iter warmup-length",
-    "--densify-until": "refine-stop-iter stop-split-at",
-    "--densify-interval": "refine-every",
-    "--opacity-reset-interval": "reset-every reset-alpha-every",
-    "--log": "tb-every tensorboard",
-    "--processes": "num-devices",
-    "--lr-means": "means-lr",
-    "--lr-log-scales": "scales-lr",
-    "--lr-quats": "quats-lr",
-    "--lr-opacity-logits": "opacities-lr",
-    "--lr-sh-dc": "sh0-lr",
-    "--lr-sh-rest": "shN-lr",
-}
+_FLAGS: dict[str, str] = read_json(Path(__file__).with_name("flags_of_others.json"))
 _INPUTS = ["data", "data-dir", "ckpt", "load-config", "input"]
 
 

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import from_json, read_json
 
 
 @dataclass(frozen=True)
@@ -29,121 +31,11 @@ class ReferenceFlag:
     only_with: str | None = None  # it is ignored, with the note, without this flag
 
 
-def _own(spellings: str, note: str = "") -> ReferenceFlag:
-    return ReferenceFlag(tuple(spellings.split()), "own", note)
-
-
-def _becomes(
-    spellings: str, new: str, note: str = "", values: int | Literal["+"] = 0, with_: str = ""
-) -> ReferenceFlag:
-    return ReferenceFlag(
-        tuple(spellings.split()), "becomes", note, tuple(new.split()), values, with_ or None
-    )
-
-
-def _ignored(spellings: str, note: str, values: int = 0) -> ReferenceFlag:
-    return ReferenceFlag(tuple(spellings.split()), "ignored", note, (), values)
-
-
-def _refused(spellings: str, note: str, values: int | Literal["+"] = 1) -> ReferenceFlag:
-    return ReferenceFlag(tuple(spellings.split()), "refused", note, (), values)
-
-
-_PAGE = "there is a page only with --view; snowsplat watch OUT shows a running training"
-_DEPTH = "--depth-weight compares the depth with the depth maps in DATASET/depths"
-_ONE_CAUSE = "a kernel that fails ends the run with its message"
-
-# The flags that train.py and render.py share.
-_SHARED = (
-    _own("--source_path -s"),
-    _own("--model_path -m"),
-    _own("--resolution -r", "-1 reduces no photo, however wide it is"),
-    _ignored("--data_device", "photos stay decoded as far as memory suffices, see --memory", 1),
-    _ignored("--convert_SHs_python", "it chooses another way to the same image"),
-    _ignored("--compute_cov3D_python", "it chooses another way to the same image"),
-    _ignored("--debug", _ONE_CAUSE),
-    _becomes("--antialiasing", "--antialias on", "its filter is 0.1 pixels², not 0.3"),
-)
-
-#: The name of the subcommand -> its program in the reference implementation, and the flags.
+#: The name of the subcommand -> its program in the reference implementation, and the flags; the
+#: table is in `reference_flags.json`.
 PROGRAMS: dict[str, tuple[str, tuple[ReferenceFlag, ...]]] = {
-    "train": (
-        "train.py",
-        (
-            *_SHARED,
-            *map(_own, ("--images -i", "--eval", "--white_background -w")),
-            _becomes("--random_background", "--background random"),
-            *map(_own, ("--sh_degree", "--iterations", "--test_iterations", "--save_iterations")),
-            *map(_own, ("--quiet", "--feature_lr", "--opacity_lr", "--scaling_lr")),
-            *map(_own, ("--rotation_lr", "--position_lr_init", "--position_lr_final")),
-            _own("--position_lr_max_steps"),
-            _ignored(
-                "--position_lr_delay_mult",
-                "its delay has 0 steps, in the reference implementation, too",
-                1,
-            ),
-            *map(_own, ("--lambda_dssim", "--percent_dense", "--densification_interval")),
-            *map(_own, ("--densify_from_iter", "--densify_until_iter")),
-            *map(_own, ("--densify_grad_threshold", "--opacity_reset_interval")),
-            _ignored("--optimizer_type", "the recipe chooses the optimiser", 1),
-            _refused(
-                "--checkpoint_iterations",
-                "use --checkpoint-every N, which saves a checkpoint every N steps",
-                "+",
-            ),
-            _refused(
-                "--start_checkpoint",
-                "use --resume, which continues from the newest checkpoint in OUT",
-            ),
-            _refused(
-                "--train_test_exp",
-                "use --exposure on, which learns a gain for each photo and colour channel",
-                0,
-            ),
-            _ignored(
-                "--exposure_lr_init --exposure_lr_final --exposure_lr_delay_steps "
-                "--exposure_lr_delay_mult",
-                "the gains of --exposure have a learning rate of their own",
-                1,
-            ),
-            _refused(
-                "--depths -d",
-                f"use --init depth+points, which starts with the depth maps; {_DEPTH}",
-            ),
-            _ignored("--depth_l1_weight_init --depth_l1_weight_final", _DEPTH, 1),
-            _becomes("--ip", "--host", _PAGE, 1, "--view"),
-            _becomes("--port", "--port", _PAGE, 1, "--view"),
-            _ignored("--disable_viewer", _PAGE),
-            _ignored("--debug_from", _ONE_CAUSE, 1),
-            _ignored("--detect_anomaly", "values that are not finite always end the training"),
-        ),
-    ),
-    "render": (
-        "render.py",
-        (
-            *_SHARED,
-            *map(_own, ("--iteration", "--skip_train", "--skip_test")),
-            _becomes("--quiet", "", "no progress is printed"),
-            _ignored(
-                "--images -i", "the photos are those of the training; -r changes their size", 1
-            ),
-            _ignored("--eval", "the photos are held out as in the training"),
-            _ignored("--white_background -w", "the background is that of the training"),
-            _ignored("--sh_degree", "that of the scene is used", 1),
-            _ignored("--depths -d", "the depth maps are for the training", 1),
-            _ignored("--train_test_exp", "images have the mean exposure of the photos"),
-        ),
-    ),
-    "evaluate": ("metrics.py", (_becomes("--model_paths -m", "--model-paths", values="+"),)),
-    "sfm": (
-        "convert.py",
-        (
-            *map(_own, ("--source_path -s", "--camera", "--skip_matching", "--resize")),
-            _ignored("--no_gpu", "photos are matched on the CPU in any case"),
-            _ignored("--colmap_executable", "COLMAP is part of the installation", 1),
-            _ignored("--magick_executable", "ImageMagick is not needed", 1),
-        ),
-    ),
+    subcommand: (each["program"], tuple(from_json(ReferenceFlag, f) for f in each["flags"]))
+    for subcommand, each in read_json(Path(__file__).with_suffix(".json")).items()
 }
 
 
