@@ -6,7 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from snowsplat.util.safe_json import read_json
 
 if TYPE_CHECKING:
     from snowsplat.cli.command import Command
@@ -60,25 +63,7 @@ def load_subcommand(name: str) -> type[Command]:
 
 
 # What to use for words that people try.
-_WORDS = {
-    "use convert (a file in another format) or publish (a web site)": "export save download",
-    "use publish (a web site), or convert SCENE FILE.html": "share upload web site html embed",
-    "use mesh": "meshes meshing obj triangles surface tsdf blender print texture polygon",
-    "use points (a dense cloud), or mesh": "pointcloud cloud las laz pcd e57 dense",
-    "use studio (by hand), or convert": "edit editor select",
-    "use convert": "crop merge compress decimate transform resize rotate scale",
-    "use view, or studio for all in the browser": "show open play viewer serve gui display",
-    "use make": "reconstruct splat build create scan run process new start",
-    "use sfm": "colmap poses cameras match dataset process-data convert.py",
-    "use train": "fit optimize optimise resume continue simple_trainer splatfacto gsplat",
-    "use benchmark": "full_eval",
-    "use evaluate": "metrics test eval psnr score compare",
-    "use render": "video movie film images",
-    "use clean": "prune filter floaters",
-    "use info": "inspect describe stats",
-    "use doctor": "check diagnose gpu devices system env",
-    "use watch": "attach monitor",
-}
+_WORDS: dict[str, str] = read_json(Path(__file__).with_name("words.json"))
 
 
 def advice(word: str) -> str | None:

@@ -5,6 +5,7 @@ the background of each step.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -48,70 +49,60 @@ class Background:
         return color.to(self.evaluation.device, non_blocking=True)
 
 
+@dataclass(eq=False)
 class ViewQueue:
     """Chooses the views of each step. Each view is chosen once in an epoch, in random order.
 
     Attributes:
+        camera_of: the present camera of a view, on the device.
+        images: loads the photos of the views.
+        downscale_at: the factor by which images are reduced at a step.
+        generator: draws the order, on the CPU.
+        batch: the number of views of an update.
+        shards: the processes; each loads only the photos of the views that it blends.
         order: indices of the views of the next steps.
         excluded: indices of the views that are not used any more.
     """
 
-    def __init__(
-        self,
-        views: Sequence[View],
-        camera_of: Callable[[int], Camera],
-        images: ImageLoader,
-        background: Background,
-        downscale_at: Callable[[int], int],
-        generator: torch.Generator,
-        batch: int,
-        shards: Shards,
-    ) -> None:
-        """
-        Args:
-            camera_of: the present camera of a view, on the device.
-            images: loads the photos of the views.
-            downscale_at: the factor by which images are reduced at a step.
-            generator: draws the order, on the CPU.
-            batch: the number of views of an update.
-            shards: the processes; each loads only the photos of the views that it blends.
-        """
-        self.order: list[int] = []
-        self.excluded: tuple[int, ...] = ()
-        self._views = views
-        self._camera_of = camera_of
-        self._images = images
-        self._background = background
-        self._downscale_at = downscale_at
-        self._generator = generator
-        self._batch = batch
-        self._shards = shards
-        self._rows = torch.arange(len(views), device=background.evaluation.device)
+    views: Sequence[View]
+    camera_of: Callable[[int], Camera]
+    images: ImageLoader
+    background: Background
+    downscale_at: Callable[[int], int]
+    generator: torch.Generator
+    batch: int
+    shards: Shards
+    order: list[int] = field(default_factory=list)
+    excluded: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        device = self.background.evaluation.device
+        self._rows = torch.arange(len(self.views), device=device)
 
     def take(self, after: int, step: int) -> list[BatchView]:
         """The views of the steps ``after`` + 1 to ``step``, at the resolution of the last one.
 
         Raises: UserError: a photo is missing or damaged.
         """
-        downscale = self._downscale_at(step)
-        ahead = max(LOOKAHEAD, self._batch)
+        downscale = self.downscale_at(step)
+        ahead = max(LOOKAHEAD, self.batch)
         if len(self.order) <= ahead:
             while len(self.order) <= ahead:
-                order = torch.randperm(len(self._views), generator=self._generator).tolist()
+                order = torch.randperm(len(self.views), generator=self.generator).tolist()
                 self.order += [i for i in order if i not in self.excluded]
             self._prefetch(downscale)
-        elif downscale != self._downscale_at(after):
+        elif downscale != self.downscale_at(after):
             self._prefetch(downscale)
         return [self._view(position, downscale) for position in range(step - after)]
 
     def _view(self, position: int, downscale: int) -> BatchView:
         """Remove the next view from the order; ``position``: its position in the batch."""
         i = self.order.pop(0)
-        own = position % self._shards.size == self._shards.rank
-        photo = self._images.get(self._views[i], downscale) if own else None
-        camera = self._camera_of(i).downscaled(downscale)
+        own = position % self.shards.size == self.shards.rank
+        photo = self.images.get(self.views[i], downscale) if own else None
+        camera = self.camera_of(i).downscaled(downscale)
         row = self._rows[i : i + 1]
-        return BatchView(i, self._views[i], camera, photo, self._background.draw(), row)
+        return BatchView(i, self.views[i], camera, photo, self.background.draw(), row)
 
     def exclude(self, indices: Iterable[int], after: int) -> None:
         """Do not use these views in the steps that follow ``after``."""
@@ -121,12 +112,12 @@ class ViewQueue:
     def continue_with(self, order: list[int], after: int) -> None:
         """Replace the order of the views of the steps that follow ``after``."""
         self.order = order
-        self._prefetch(self._downscale_at(after + 1))
+        self._prefetch(self.downscale_at(after + 1))
 
     def _prefetch(self, downscale: int) -> None:
         own = [
-            self._views[i]
+            self.views[i]
             for position, i in enumerate(self.order)
-            if position % self._batch % self._shards.size == self._shards.rank
+            if position % self.batch % self.shards.size == self.shards.rank
         ]
-        self._images.prefetch(own, downscale)
+        self.images.prefetch(own, downscale)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, InitVar, dataclass, field
 
 import torch
 from torch import Tensor
@@ -24,6 +25,7 @@ from snowsplat.training.step.view_gradient import ViewGradient
 _BETA2 = 0.999
 
 
+@dataclass(eq=False)
 class Adam:
     """The first and second moments of every parameter. Row i of a moment belongs to Gaussian i.
 
@@ -31,39 +33,28 @@ class Adam:
     control) must make the same change here, with `select`.
 
     Attributes:
+        extent: extent of the scene, in world units; the learning rate of the means is multiplied
+            by it.
+        views: number of training views; see `LearningRates.at`.
+        beta1: β₁ for a batch of one view.
+        visible_only: whether a step leaves Gaussians unchanged that its view does not see.
+        shards: the processes; ``gaussians`` are those of this process.
         rows: further tensors with one row for each Gaussian of this process, which `select` keeps
             in the same order; see `Run.rows`.
     """
 
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        rates: LearningRates,
-        *,
-        schedule: Schedule,
-        extent: float,
-        views: int = 0,
-        beta1: float = 0.9,
-        visible_only: bool = False,
-        shards: Shards = ALONE,
-    ) -> None:
-        """
-        Args:
-            extent: extent of the scene, in world units; the learning rate of the means is
-                multiplied by it.
-            views: number of training views; see `LearningRates.at`.
-            beta1: β₁ for a batch of one view.
-            visible_only: whether a step leaves Gaussians unchanged that its view does not see.
-            shards: the processes; ``gaussians`` are those of this process.
-        """
-        self.rates = rates
-        self.schedule = schedule
-        self.extent = extent
-        self.views = views
-        self.beta1 = beta1
-        self.visible_only = visible_only
-        self.shards = shards
-        self.rows: dict[str, Tensor] = {}
+    gaussians: InitVar[Gaussians]
+    rates: LearningRates
+    _: KW_ONLY
+    schedule: Schedule
+    extent: float
+    views: int = 0
+    beta1: float = 0.9
+    visible_only: bool = False
+    shards: Shards = ALONE
+    rows: dict[str, Tensor] = field(default_factory=dict)
+
+    def __post_init__(self, gaussians: Gaussians) -> None:
         parameters = gaussians.parameters()
         self.exp_avg = {name: torch.zeros_like(p) for name, p in parameters.items()}
         self.exp_avg_sq = {name: torch.zeros_like(p) for name, p in parameters.items()}

@@ -37,24 +37,7 @@ GROUND = "ground.glb"
 #: makes 4 characters of 3 bytes.
 _LARGEST = 360_000_000
 # The scene is passed to the viewer as a blob URL, because browsers limit the length of data URLs.
-_SCENE = """        <script type="text/plain" id="scene">{scene}</script>
-        <script>
-            const scene = document.getElementById('scene');
-            const base64 = scene.textContent;
-            scene.remove();
-            const parts = [];
-            for (let at = 0; at < base64.length; at += 1 << 22) {{
-                const text = atob(base64.slice(at, at + (1 << 22)));
-                const bytes = new Uint8Array(text.length);
-                for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
-                parts.push(bytes);
-            }}
-            const bootstrap = document.getElementById('sse-bootstrap');
-            const contentUrl = URL.createObjectURL(new Blob(parts));
-            bootstrap.textContent = JSON.stringify({{
-                ...JSON.parse(bootstrap.textContent), contentUrl
-            }});
-        </script>"""
+_SCENE = Path(__file__).with_name("inline_scene.html")
 
 
 def write_one_file(folder: Path, gaussians: Gaussians) -> str:
@@ -179,7 +162,14 @@ def write_html(path: Path | str, scene: ReadyScene, about: Description | None = 
         )
     pictures = f"data:image/webp;base64,{_base64(scene.stops.pictures)}"
     bootstrap = scene.bootstrap(about, pictures) | {"contentFilename": "scene.sog"}
-    write_text(path, whole_page(about.title, bootstrap, _SCENE.format(scene=_base64(content))))
+    write_text(
+        path,
+        whole_page(
+            about.title,
+            bootstrap,
+            _SCENE.read_text("utf-8").rstrip("\n").format(scene=_base64(content)),
+        ),
+    )
 
 
 def _base64(content: bytes) -> str:

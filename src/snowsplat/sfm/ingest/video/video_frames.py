@@ -79,9 +79,6 @@ def rgb_image(frame: VideoFrame) -> np.ndarray:
     return map_tones(deep, transfer)
 
 
-if TYPE_CHECKING:
-    from av import VideoFrame
-
 logger = logging.getLogger(__name__)
 
 SAME_VIEW = message("shows the same view as the previous frame")
