@@ -19,50 +19,62 @@ in `snowsplat.ops`.
 
 from typing import TYPE_CHECKING
 
-from snowsplat._version import __version__
+from snowsplat._version import __version__ as __version__
 from snowsplat.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from snowsplat.data import Dataset, Points, View, load_dataset
-    from snowsplat.evaluation.metrics import evaluate_views
-    from snowsplat.extras.globe.make_globe import make_globe
-    from snowsplat.extras.globe.options import GlobeOptions
-    from snowsplat.extras.image.fit_image import decode_image, fit_image
-    from snowsplat.extras.image.options import FitOptions
-    from snowsplat.extras.lift.lift_photo import LiftResult, lift_photo
-    from snowsplat.extras.lift.options import DepthSource, LiftOptions
-    from snowsplat.extras.lift.refine_photo import refine_photo
-    from snowsplat.formats import read_gaussians
-    from snowsplat.pipeline.benchmark.run import benchmark
-    from snowsplat.pipeline.blocks.plan import plan_blocks
-    from snowsplat.pipeline.blocks.train import merge_blocks, train_blocks
-    from snowsplat.pipeline.clean import clean
-    from snowsplat.pipeline.compute import Compute
-    from snowsplat.pipeline.convert import convert
-    from snowsplat.pipeline.describe import describe
-    from snowsplat.pipeline.make import make
-    from snowsplat.pipeline.observer import Observer
-    from snowsplat.pipeline.options.benchmark import BenchmarkOptions, PlanOptions
-    from snowsplat.pipeline.options.make import MakeOptions
-    from snowsplat.pipeline.options.scene import Edits, PublishOptions
-    from snowsplat.pipeline.options.train import TrainOptions
-    from snowsplat.pipeline.options.video import VideoOptions
-    from snowsplat.pipeline.output.scene_files import write_gaussians
-    from snowsplat.pipeline.output.scene_source import load_trained
-    from snowsplat.pipeline.publish import publish
-    from snowsplat.pipeline.render import evaluate, render_images
-    from snowsplat.pipeline.run.results import TrainingStopped
-    from snowsplat.pipeline.train import resume, train
-    from snowsplat.pipeline.videos import render_video
-    from snowsplat.scene.camera import Camera
-    from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.scene.rasterization import rasterization
-    from snowsplat.training.core.trainer import Trainer
-    from snowsplat.training.parts.list import parts_of, register_part
-    from snowsplat.training.parts.part import Part
-    from snowsplat.training.settings.config import TrainConfig
-    from snowsplat.training.settings.recipes import recipe
-    from snowsplat.util.errors import UserError
+    from snowsplat.data import Dataset as Dataset
+    from snowsplat.data import Points as Points
+    from snowsplat.data import View as View
+    from snowsplat.data import load_dataset as load_dataset
+    from snowsplat.evaluation.metrics import evaluate_views as evaluate_views
+    from snowsplat.extras.globe.make_globe import make_globe as make_globe
+    from snowsplat.extras.globe.options import GlobeOptions as GlobeOptions
+    from snowsplat.extras.image.fit_image import decode_image as decode_image
+    from snowsplat.extras.image.fit_image import fit_image as fit_image
+    from snowsplat.extras.image.options import FitOptions as FitOptions
+    from snowsplat.extras.lift.lift_photo import LiftResult as LiftResult
+    from snowsplat.extras.lift.lift_photo import lift_photo as lift_photo
+    from snowsplat.extras.lift.options import DepthSource as DepthSource
+    from snowsplat.extras.lift.options import LiftOptions as LiftOptions
+    from snowsplat.extras.lift.refine_photo import refine_photo as refine_photo
+    from snowsplat.formats import read_gaussians as read_gaussians
+    from snowsplat.pipeline.benchmark.run import benchmark as benchmark
+    from snowsplat.pipeline.blocks.plan import plan_blocks as plan_blocks
+    from snowsplat.pipeline.blocks.train import merge_blocks as merge_blocks
+    from snowsplat.pipeline.blocks.train import train_blocks as train_blocks
+    from snowsplat.pipeline.clean import clean as clean
+    from snowsplat.pipeline.compute import Compute as Compute
+    from snowsplat.pipeline.convert import convert as convert
+    from snowsplat.pipeline.describe import describe as describe
+    from snowsplat.pipeline.make import make as make
+    from snowsplat.pipeline.observer import Observer as Observer
+    from snowsplat.pipeline.options.benchmark import BenchmarkOptions as BenchmarkOptions
+    from snowsplat.pipeline.options.benchmark import PlanOptions as PlanOptions
+    from snowsplat.pipeline.options.make import MakeOptions as MakeOptions
+    from snowsplat.pipeline.options.scene import Edits as Edits
+    from snowsplat.pipeline.options.scene import PublishOptions as PublishOptions
+    from snowsplat.pipeline.options.train import TrainOptions as TrainOptions
+    from snowsplat.pipeline.options.video import VideoOptions as VideoOptions
+    from snowsplat.pipeline.output.scene_files import write_gaussians as write_gaussians
+    from snowsplat.pipeline.output.scene_source import load_trained as load_trained
+    from snowsplat.pipeline.publish import publish as publish
+    from snowsplat.pipeline.render import evaluate as evaluate
+    from snowsplat.pipeline.render import render_images as render_images
+    from snowsplat.pipeline.run.results import TrainingStopped as TrainingStopped
+    from snowsplat.pipeline.train import resume as resume
+    from snowsplat.pipeline.train import train as train
+    from snowsplat.pipeline.videos import render_video as render_video
+    from snowsplat.scene.camera import Camera as Camera
+    from snowsplat.scene.gaussians import Gaussians as Gaussians
+    from snowsplat.scene.rasterization import rasterization as rasterization
+    from snowsplat.training.core.trainer import Trainer as Trainer
+    from snowsplat.training.parts.list import parts_of as parts_of
+    from snowsplat.training.parts.list import register_part as register_part
+    from snowsplat.training.parts.part import Part as Part
+    from snowsplat.training.settings.config import TrainConfig as TrainConfig
+    from snowsplat.training.settings.recipes import recipe as recipe
+    from snowsplat.util.errors import UserError as UserError
 
 
 _MODULES = {
@@ -120,60 +132,5 @@ _MODULES = {
     "write_gaussians": "pipeline.output.scene_files",
 }
 
-__all__ = [
-    "BenchmarkOptions",
-    "Camera",
-    "Compute",
-    "Dataset",
-    "DepthSource",
-    "Edits",
-    "FitOptions",
-    "Gaussians",
-    "GlobeOptions",
-    "LiftOptions",
-    "LiftResult",
-    "MakeOptions",
-    "Observer",
-    "Part",
-    "PlanOptions",
-    "Points",
-    "PublishOptions",
-    "TrainConfig",
-    "TrainOptions",
-    "Trainer",
-    "TrainingStopped",
-    "UserError",
-    "VideoOptions",
-    "View",
-    "__version__",
-    "benchmark",
-    "clean",
-    "convert",
-    "decode_image",
-    "describe",
-    "evaluate",
-    "evaluate_views",
-    "fit_image",
-    "lift_photo",
-    "load_dataset",
-    "load_trained",
-    "make",
-    "make_globe",
-    "merge_blocks",
-    "parts_of",
-    "plan_blocks",
-    "publish",
-    "rasterization",
-    "read_gaussians",
-    "recipe",
-    "refine_photo",
-    "register_part",
-    "render_images",
-    "render_video",
-    "resume",
-    "train",
-    "train_blocks",
-    "write_gaussians",
-]
-
+__all__ = sorted([*_MODULES, "__version__"])
 __getattr__, __dir__ = lazy_names(__name__, _MODULES)

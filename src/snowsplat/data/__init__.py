@@ -9,32 +9,18 @@ from typing import TYPE_CHECKING
 from snowsplat.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from snowsplat.data.dataset import Dataset, Points, View
-    from snowsplat.data.frame.bounds import scene_extent
-    from snowsplat.data.load import (
-        DatasetFiles,
-        load_dataset,
-        read_dataset,
-        read_files,
-        read_undamaged,
-    )
-    from snowsplat.data.photos.decode import ImageSource, LoadedImage
-    from snowsplat.data.photos.image_loader import ImageLoader
-
-__all__ = [
-    "Dataset",
-    "DatasetFiles",
-    "ImageLoader",
-    "ImageSource",
-    "LoadedImage",
-    "Points",
-    "View",
-    "load_dataset",
-    "read_dataset",
-    "read_files",
-    "read_undamaged",
-    "scene_extent",
-]
+    from snowsplat.data.dataset import Dataset as Dataset
+    from snowsplat.data.dataset import Points as Points
+    from snowsplat.data.dataset import View as View
+    from snowsplat.data.frame.bounds import scene_extent as scene_extent
+    from snowsplat.data.load import DatasetFiles as DatasetFiles
+    from snowsplat.data.load import load_dataset as load_dataset
+    from snowsplat.data.load import read_dataset as read_dataset
+    from snowsplat.data.load import read_files as read_files
+    from snowsplat.data.load import read_undamaged as read_undamaged
+    from snowsplat.data.photos.decode import ImageSource as ImageSource
+    from snowsplat.data.photos.decode import LoadedImage as LoadedImage
+    from snowsplat.data.photos.image_loader import ImageLoader as ImageLoader
 
 _MODULES = {
     "Dataset": "dataset",
@@ -50,4 +36,5 @@ _MODULES = {
     "read_undamaged": "load",
     "scene_extent": "frame.bounds",
 }
+__all__ = sorted(_MODULES)
 __getattr__, __dir__ = lazy_names(__name__, _MODULES)
