@@ -210,7 +210,7 @@ def test_a_full_disk_keeps_finished_stages(garden, photos, run, tmp_path, monkey
     assert not (out / "images_2").exists()  # that of the command with --resize
 
 
-@pytest.mark.parametrize("command", ["sfm", "make"])
+@pytest.mark.parametrize("command", ["sfm", pytest.param("make", marks=pytest.mark.nightly)])
 def test_without_pycolmap_the_remedy_is_named(photos, tmp_path, command):
     package = tmp_path / "modules" / "pycolmap"
     package.mkdir(parents=True)

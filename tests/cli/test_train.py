@@ -138,14 +138,13 @@ def wait_for(path: Path, process) -> None:
         time.sleep(0.002)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path, number):
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path):
+    stopped = tmp_path / "stopped"
     process = start("train", dataset, "-o", stopped, "--iterations", 100_000, "--threads", 1)
     deadline = time.monotonic() + 60
     while "step" not in (process.stdout.readline() if process.poll() is None else "step"):
         assert time.monotonic() < deadline
-    process.send_signal(number)
+    process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, (out, err)
     assert err == ""
@@ -157,7 +156,6 @@ def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path, number):
     more = step + 5
     assert run("train", "-o", stopped, "--resume", "--iterations", more).code == 0
     assert len(scene(stopped, more)) > 1000
-    assert not whole.exists()
 
 
 def test_a_second_ctrl_c_saves_no_incomplete_step(run, dataset, tmp_path, monkeypatch):

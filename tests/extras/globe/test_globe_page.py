@@ -271,6 +271,10 @@ def test_the_buttons_work_while_the_page_runs(page):
     page.wait_for("!document.getElementById('remember').disabled", 60)
     page.evaluate("snowGlobe.shaken = Infinity")
     page.evaluate(press % "remember")
+    page.wait_for("snowGlobe.result.remembering")
+    page.evaluate("snowGlobe.paused = true")
+    advance(page, 3.0)
+    page.evaluate("snowGlobe.paused = false")  # the rest in real time
     page.wait_for("snowGlobe.result.standing", 120)
     page.evaluate("snowGlobe.paused = true, snowGlobe.turned = 0, snowGlobe.seconds = 0")
 
