@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 
@@ -32,11 +33,17 @@ def paper(number: int) -> np.ndarray:
     return cv2.copyMakeBorder(marker, 70, 70, 70, 70, cv2.BORDER_CONSTANT, value=255)
 
 
-def photograph(pose: np.ndarray, sizes: dict[int, float], places: dict) -> np.ndarray:
-    """A grey photo (H, W) of markers on a grey ground; every pixel is the mean of 4 rays."""
+@functools.cache
+def rays_of_pixels() -> np.ndarray:
+    """(4 H W, 3) in the frame of the camera; four rays for each pixel."""
     x, y = np.meshgrid((np.arange(2 * WIDTH) + 0.5) / 2, (np.arange(2 * HEIGHT) + 0.5) / 2)
     rays = LENS.cam_from_img(np.stack([x.ravel(), y.ravel()], 1))
-    rays = np.column_stack([rays, np.ones(len(rays))]) @ pose[:, :3]
+    return np.column_stack([rays, np.ones(len(rays))])
+
+
+def photograph(pose: np.ndarray, sizes: dict[int, float], places: dict) -> np.ndarray:
+    """A grey photo (H, W) of markers on a grey ground; every pixel is the mean of 4 rays."""
+    rays = rays_of_pixels() @ pose[:, :3]
     centre = -pose[:, :3].T @ pose[:, 3]
     light = np.full(len(rays), 0.2)
     for number, (px, py, pz, turn) in places.items():
