@@ -88,7 +88,8 @@ def write_photos(folder, count=3, ending="jpg", start=0):
 def write_video(path, pictures, rate=10, rotation=None, codec="libx264", times=None, aspect=None):
     """Encode (H, W, 3) uint8 images; with ``times`` (in 1/1000 s) the frame rate is variable."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=rate)
+        fast = {"preset": "ultrafast", "threads": "1"} if codec == "libx264" else {}
+        stream = container.add_stream(codec, rate=rate, options=fast)
         stream.height, stream.width = pictures[0].shape[:2]
         stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
         if aspect:
