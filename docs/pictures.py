@@ -5,12 +5,12 @@
     snowsplat make out/table -o out/scenes/table
     git clone https://github.com/pierotofy/dataset_banana out/banana  # 16 photos, MIT License
     snowsplat make out/banana/images -o out/scenes/banana --quality draft
-    python docs/pictures.py out/scenes/table out/scenes/banana
+    python docs/pictures.py out/scenes/table out/scenes/banana out/banana/images
 
 Needs Chromium. Writes to docs/pictures: scene.webp and real.webp (moving pictures: the camera moves
-around the scene), studio.webp (the page of the scene in the studio), globe.webp (a moving picture:
-the scene in a snow globe), web.webp and live.webp (the two viewers) and report.webp (the report of
-the training).
+around the scene), studio.webp (a film of the studio, from the photos to the scene), globe.webp (a
+moving picture: the scene in a snow globe), web.webp and live.webp (the two viewers) and report.webp
+(the report of the training).
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from urllib.parse import quote
 
 import av
 from PIL import Image
@@ -39,6 +38,9 @@ WIDTH, HEIGHT = 1280, 800
 #: The moving picture: a size and rate that make it small enough for a page that is often opened.
 FILM = snowsplat.VideoOptions(path="ellipse", seconds=5.0, fps=10.0, size="560x350")
 FILM_QUALITY = 42
+#: The film of the studio: what the tab has, what is kept of it.
+STUDIO_SIZE, STUDIO_SHOWN, STUDIO_QUALITY = (1120, 780), (784, 546), 40
+STUDIO_RUNNING = 60  # pictures of the job
 GLOBE = snowsplat.GlobeOptions(name="snowsplat", size="400", fps=10.0)
 GLOBE_QUALITY = 30
 
@@ -82,19 +84,89 @@ def shoot(page: Page, target: Path) -> None:
     Image.fromarray(page.screenshot()).save(target, quality=85, method=6)
 
 
-def studio(made: Path, browser: Browser, target: Path) -> None:
-    """The page of a scene in the studio of its folder."""
-    command = [sys.executable, "-m", "snowsplat", "studio", str(made.parent), "--no-browser"]
+class Recording:
+    """A film of a tab: pictures, and for how many milliseconds each is shown."""
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self.images: list[Image.Image] = []
+        self._durations: list[int] = []
+
+    def hold(self, milliseconds: int) -> None:
+        """Show what the tab shows now; what has not changed is shown for longer."""
+        image = Image.fromarray(self._page.screenshot()).resize(
+            STUDIO_SHOWN, Image.Resampling.LANCZOS
+        )
+        if self.images and image.tobytes() == self.images[-1].tobytes():
+            self._durations[-1] += milliseconds
+        else:
+            self.images.append(image)
+            self._durations.append(milliseconds)
+
+    def thin(self, first: int, most: int) -> None:
+        """Keep at most so many of the pictures from this one on, at equal distances."""
+        step = -(-(len(self.images) - first) // most)
+        self.images[first:] = self.images[first::step]
+        self._durations[first:] = self._durations[first::step]
+
+    def save(self, target: Path) -> None:
+        first, *rest = self.images
+        options = {"quality": STUDIO_QUALITY, "method": 6, "minimize_size": True, "loop": 0}
+        first.save(target, save_all=True, append_images=rest, duration=self._durations, **options)
+
+
+def studio(photos: Path, target: Path) -> None:
+    """A film of the studio: photos are dropped and looked at, and become a scene, which turns."""
+    with (
+        TemporaryDirectory() as folder,
+        served(Path(folder)) as url,
+        Browser(*STUDIO_SIZE, frames=10.0) as browser,
+    ):
+        page = browser.open(url)
+        film = Recording(page)
+        page.wait_for("!!document.querySelector('.drop')")
+        film.hold(1200)
+        page.drop(photos)
+        page.wait_for("!!document.querySelector('form.card:not([hidden]) .main')", 600)
+        page.wait_for("/\\d/.test(document.querySelector('[data-quality=draft]').textContent)", 600)
+        film.hold(1500)
+        page.evaluate("document.querySelector('input[value=draft]').click()")
+        page.evaluate("document.querySelector('form.card').scrollIntoView({block: 'end'})")
+        film.hold(1200)
+        page.evaluate("document.querySelector('form.card .main').click()")
+        page.evaluate("window.scrollTo(0, 0)")
+        status = "document.querySelector('.status').dataset.status"
+        page.wait_for(f"{status} === 'running'", 600)
+        began = len(film.images)
+        while page.evaluate(status) == "running":
+            film.hold(120)
+            time.sleep(1.0)
+        film.thin(began, STUDIO_RUNNING)
+        page.wait_for("!!document.querySelector('iframe.viewer')?.contentWindow?.app", 600)
+        time.sleep(8)  # the first picture is coarse
+        film.hold(1500)
+        mouse = {"button": "left", "clickCount": 1}
+        page.call("Input.dispatchMouseEvent", type="mousePressed", x=460, y=460, **mouse)
+        for i in range(24):
+            x = 460 + 12 * i
+            page.call(
+                "Input.dispatchMouseEvent", type="mouseMoved", x=x, y=460, button="left", buttons=1
+            )
+            time.sleep(0.1)
+            film.hold(100)
+        page.call("Input.dispatchMouseEvent", type="mouseReleased", x=x, y=460, **mouse)
+        time.sleep(1)
+        film.hold(2000)
+        film.save(target)
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of the studio of a folder, which ends with the context."""
+    command = [sys.executable, "-m", "snowsplat", "studio", str(folder), "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        url = next(line.split()[-1] for line in process.stdout if "http://" in line)
-        page = browser.open(f"{url}#{quote(made.name)}")
-        page.wait_for("!!document.querySelector('iframe')", 200)
-        page.wait_for("!!document.querySelector('iframe').contentWindow.app", 200)
-        page.evaluate("window.scrollTo(0, 60)")
-        time.sleep(3)
-        shoot(page, target)
-        page.close()
+        yield next(line.split()[-1] for line in process.stdout if "http://" in line)
         process.terminate()
 
 
@@ -117,14 +189,14 @@ def training(dataset: Path) -> Iterator[str]:
             process.terminate()
 
 
-def main(made: Path, real: Path) -> None:
+def main(made: Path, real: Path, photos: Path) -> None:
     PICTURES.mkdir(exist_ok=True)
     film(made, PICTURES / "scene.webp")
     film(real, PICTURES / "real.webp")
     globe(made, PICTURES / "globe.webp")
+    studio(photos.absolute(), PICTURES / "studio.webp")
     with Browser(WIDTH, HEIGHT, frames=5.0) as browser, TemporaryDirectory() as folder:
         shoot(browser.open((made / "scene" / "report.html").as_uri()), PICTURES / "report.webp")
-        studio(made, browser, PICTURES / "studio.webp")
         html = Path(folder) / "scene.html"
         snowsplat.convert(made, html)
         page = browser.open(f"{html.as_uri()}?webgl")

@@ -230,13 +230,7 @@ class Browser:
         page = self._process.pages[session] = Page(self._process, session, target)
         for domain in ("Page", "Runtime", "Log", "Network"):
             page.call(f"{domain}.enable")
-        page.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=self.width,
-            height=self.height,
-            deviceScaleFactor=self.scale,
-            mobile=False,
-        )
+        page.resize(self.width, self.height, self.scale)
         page.call(
             "Page.addScriptToEvaluateOnNewDocument", source=_SLOW_FRAMES % (1e3 / self.frames)
         )
@@ -340,6 +334,27 @@ class Page:
             x, y = x0 + (x1 - x0) * i / steps, y0 + (y1 - y0) * i / steps
             self._mouse("mouseMoved", x, y, button="left", buttons=1)
         self._mouse("mouseReleased", x1, y1, button="left", clickCount=1)
+
+    def key(self, key: str, modifiers: int = 0, **more: Any) -> None:
+        """Press and release a key; ``modifiers``: the sum of 1 Alt, 2 Control, 8 Shift."""
+        number = {"Tab": 9, "Enter": 13, "Escape": 27}.get(key, ord(key.upper()[0]))
+        text = {"Enter": "\r"}.get(key, key if len(key) == 1 and modifiers < 2 else "")
+        event = {"key": key, "code": f"Key{key.upper()}" if key.isalpha() and text else key} | more
+        for kind in ("keyDown" if text else "rawKeyDown", "keyUp"):
+            typed = {"text": text} if kind == "keyDown" else {}
+            event |= {"windowsVirtualKeyCode": number, "modifiers": modifiers}
+            self.call("Input.dispatchKeyEvent", type=kind, **event, **typed)
+
+    def drop(self, path: Path, x: float = 400, y: float = 200) -> None:
+        """Drop a file or folder on the page."""
+        data = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
+        for kind in ("dragEnter", "dragOver", "drop"):
+            self.call("Input.dispatchDragEvent", type=kind, x=x, y=y, data=data)
+
+    def resize(self, width: int, height: int, scale: float = 1.0) -> None:
+        """Give the tab another size, as `Browser` says."""
+        size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
 
     def close(self) -> None:
         """Close the tab."""

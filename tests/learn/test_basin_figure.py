@@ -61,9 +61,7 @@ def place(page: Page, target: float) -> None:
         now = value(page, "position0")
         if abs(now - target) < 0.2:
             return
-        key = "ArrowRight" if now < target else "ArrowLeft"
-        page.call("Input.dispatchKeyEvent", type="keyDown", key=key)
-        page.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+        page.key("ArrowRight" if now < target else "ArrowLeft")
     raise AssertionError("the keys do not move the Gaussian")
 
 

@@ -94,8 +94,7 @@ def press(page: Page, figure: str, name: str) -> None:
 def keys(page: Page, figure: str, selector: str, key: str, times: int = 1) -> None:
     page.evaluate(f"{part(figure, selector)}.focus()")
     for _ in range(times):
-        page.call("Input.dispatchKeyEvent", type="keyDown", key=key)
-        page.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+        page.key(key)
 
 
 def place(page: Page, figure: str, selector: str) -> tuple[float, float]:
@@ -405,9 +404,7 @@ def test_live_fit_of_a_dropped_picture(page, tmp_path):
     pixels = np.stack([4 * x, 5 * y, np.where((x // 16 + y // 16) % 2, 200, 40)], axis=-1)
     Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / "squares.png")
     left, top = place(page, "fit", "canvas")
-    dropped = {"items": [], "files": [str(tmp_path / "squares.png")], "dragOperationsMask": 1}
-    for kind in ("dragEnter", "dragOver", "drop"):
-        page.call("Input.dispatchDragEvent", type=kind, x=left, y=top, data=dropped)
+    page.drop(tmp_path / "squares.png", left, top)
     page.wait_for(part("fit", "canvas") + ".width === 64")
     page.wait_for(part("fit", ".status") + ".textContent.includes('Step 0 ')")
     put(page, "fit", "most", 1000)  # enough that it is not finished at the pause
@@ -422,9 +419,7 @@ def test_live_fit_of_a_dropped_picture(page, tmp_path):
     # A file that is no picture is refused, and the fit goes on.
     (tmp_path / "no.png").write_text("no picture")
     left, top = place(page, "fit", "canvas")  # the text above may have become longer
-    dropped["files"] = [str(tmp_path / "no.png")]
-    for kind in ("dragEnter", "dragOver", "drop"):
-        page.call("Input.dispatchDragEvent", type=kind, x=left, y=top, data=dropped)
+    page.drop(tmp_path / "no.png", left, top)
     page.wait_for(part("fit", ".status") + ".textContent.includes('not a picture')")
     before = page.evaluate(step)
     press(page, "fit", "run")

@@ -81,16 +81,6 @@ def faces(page: Page) -> list[float]:
     )
 
 
-def key(page: Page, name: str, *, control: bool = False, at: float | None = None) -> None:
-    """``at``: seconds since 1970, of the event."""
-    more = {} if at is None else {"timestamp": at}
-    for kind in ("rawKeyDown", "keyUp"):
-        modifiers = 2 * control
-        page.call(
-            "Input.dispatchKeyEvent", type=kind, key=name, code=name, modifiers=modifiers, **more
-        )
-
-
 # Whether the first handle has not moved for a second.
 STILL = """(() => {
     const { left } = document.querySelector(".snow-handle").getBoundingClientRect();
@@ -130,22 +120,22 @@ def test_box_and_level_by_clicks(studio, finished):
         # Keys with a short time between them are one step; a drag is one, too.
         begin, step = time.time(), (before[1] - before[0]) / 100
         for seconds in (0.0, 0.3, 0.6, 2.0):
-            key(page, "ArrowLeft", at=begin + seconds)
+            page.key("ArrowLeft", timestamp=begin + seconds)
         assert faces(page)[1] == pytest.approx(before[1] - 4 * step)
         end = faces(page)
-        key(page, "z", control=True)
+        page.key("z", 2)
         assert faces(page)[1] == pytest.approx(before[1] - 3 * step)
-        key(page, "z", control=True)
+        page.key("z", 2)
         assert faces(page) == after
         press(page, "Box")  # the box is closed, and shown again by what undoes a step of it
         assert page.evaluate("document.querySelector('.snow-handles').hidden")
-        key(page, "z", control=True)
+        page.key("z", 2)
         assert not page.evaluate("document.querySelector('.snow-handles').hidden")
         assert faces(page) == before
         press(page, "Redo")
         assert faces(page) == after
         for _ in range(2):
-            key(page, "y", control=True)
+            page.key("y", 2)
         assert faces(page) == end
         x, y, width, height = page.evaluate(
             "(({ x, y, width, height }) => [x, y, width, height])"

@@ -46,7 +46,7 @@ def test_what_is_left_of_an_edit_is_done(studio, finished, monkeypatch, before):
     with monkeypatch.context() as patch:
         patch.setattr(changes, before, killed)
         with pytest.raises(Killed):
-            changes.edit_scene(finished, changes.Version(finished.version()))
+            changes.edit_scene(finished, finished.version())
     is_edited = before != "edit"
     address = f"scenes/{finished.name}"
     about = studio.ask(address)[1]
@@ -85,7 +85,7 @@ def test_a_failed_edit_leaves_nothing(studio, finished):
     write_json(finished.plan, asdict(PageFilm(KEYS)))
     write_json(finished.edits, edit_of(~NOTHING, title="Nothing", scale=2.0))
     with pytest.raises(UserError, match="nothing would be left"):
-        changes.edit_scene(finished, changes.Version(finished.version()))
+        changes.edit_scene(finished, finished.version())
     file = finished.scene_file()
     os.utime(file, ns=(1, file.stat().st_mtime_ns + 1))
     write_json(finished.plan, asdict(PageFilm(KEYS[::-1])))
@@ -98,9 +98,9 @@ def test_a_new_title_is_newer_than_that_of_a_killed_edit(finished, monkeypatch):
     write_json(finished.edits, edit_of(np.arange(N) < 20, title="Half"))
     with monkeypatch.context() as patch:
         patch.setattr(changes, "show_scene", lambda scene: {})  # the process is killed before it
-        changes.edit_scene(finished, changes.Version(finished.version()))
+        changes.edit_scene(finished, finished.version())
     assert finished.begun.exists()
-    changes.rename(finished, changes.Title("Whole"))
+    changes.rename(finished, "Whole")
     assert finished.job.title == "Whole"
     assert not finished.begun.exists()
 

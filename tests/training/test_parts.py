@@ -188,6 +188,11 @@ class Counted(Part):
         self.steps = int(tensors["steps"])
 
 
+def test_a_misspelt_method_is_reported():
+    with pytest.raises(UserError, match="Mine.regulariser is never called; regularizer is"):
+        type("Mine", (Part,), {"regulariser": print})
+
+
 class Renamed(Part):
     """Has the name of a part of the package."""
 

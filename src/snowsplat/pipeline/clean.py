@@ -90,7 +90,8 @@ def clean(
         cameras = [view.camera for view in [*photos.train, *photos.test]]
     if not cameras:
         raise UserError(
-            "{scene}: the cameras are unknown, because it is in no output folder; set `dataset`",
+            "{scene}: the cameras are unknown, because it is in no output folder; set `dataset`, "
+            "or edit it in snowsplat studio",
             scene=scene,
         )
     gaussians = gaussians.to(device)

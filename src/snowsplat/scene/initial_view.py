@@ -16,8 +16,9 @@ from snowsplat.scene.geometry import Similarity, look_at
 _OVERVIEW_DISTANCE = 2.77
 # What is farther from the median than this many times the median distance is considered background.
 _BACKGROUND_RATIO = 4.0
-# The rest extends from the first of these quantiles to the second.
+# The rest extends from the first of these quantiles to the second, or to its ends if they are near.
 _EXTENT = torch.tensor([0.02, 0.98], dtype=torch.float64)
+_NEAR_END = 1.15  # times the second one
 # Number of Gaussians that are used for medians and quantiles.
 _ROWS_SAMPLED = 100_000
 
@@ -76,8 +77,8 @@ def view_of_camera(camera: Camera, depth: float) -> InitialView:
 def bounding_sphere(gaussians: Gaussians) -> tuple[Tensor, float]:
     """The middle (3,) and the radius of what a scene shows; needs no cameras.
 
-    The sphere contains 98% of the opaque Gaussians, except for those much farther from the median
-    than half of them: these are background, and the sphere contains the object in front of them.
+    The sphere contains 98% of the opaque Gaussians, all if the rest is near them, except for those
+    much farther from the median than half of them: these are background of the object.
     """
     means = gaussians.means.detach()
     finite = means.isfinite().all(1)
@@ -88,9 +89,16 @@ def bounding_sphere(gaussians: Gaussians) -> tuple[Tensor, float]:
         return torch.zeros(3, dtype=torch.float64), 1.0
     median = seen.median(0).values
     distances = (seen - median).norm(dim=1)
-    near = seen[distances <= _BACKGROUND_RATIO * distances.median()]
+    near = seen[distances <= _end(distances, _BACKGROUND_RATIO * float(distances.median()))]
     middle = near.quantile(_EXTENT, dim=0).mean(0)
-    return middle, max(float((near - middle).norm(dim=1).quantile(_EXTENT[1])), 1e-6)
+    distances = (near - middle).norm(dim=1)
+    return middle, max(_end(distances, float(distances.quantile(_EXTENT[1]))), 1e-6)
+
+
+def _end(distances: Tensor, limit: float) -> float:
+    """The largest distance, if that is at most slightly beyond a limit; else the limit."""
+    largest = float(distances.max())
+    return largest if largest <= _NEAR_END * limit else limit
 
 
 def overview(gaussians: Gaussians) -> InitialView:

@@ -38,28 +38,6 @@ from snowsplat.studio.library import safe_title
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import new_entries, remove_temporaries, write_json
 from snowsplat.util.safe_json import from_json, is_file, read_json
-from snowsplat.util.settings import Settings
-
-
-@dataclass(frozen=True)
-class Export(Settings):
-    """The settings of `export`: a kind of file, see `FORMATS`."""
-
-    kind: str
-
-
-@dataclass(frozen=True)
-class Title(Settings):
-    """The settings of `rename`."""
-
-    title: str
-
-
-@dataclass(frozen=True)
-class Version(Settings):
-    """The settings of `edit_scene` and `undo_edit`: the scene that a page shows; "": any."""
-
-    version: str
 
 
 def finished(scene: StudioScene) -> Path:
@@ -70,12 +48,11 @@ def finished(scene: StudioScene) -> Path:
     return file
 
 
-def export(scene: StudioScene, settings: Export) -> dict[str, Any]:
-    """Write the scene in another format, unless that is done; returns the name of the file.
+def export(scene: StudioScene, kind: str) -> dict[str, Any]:
+    """Write the scene as a kind of `FORMATS`, unless that is done; returns the name of the file.
 
     Raises: UserError: the scene is not finished.
     """
-    kind = settings.kind
     file, target = finished(scene), export_file(scene, kind)
     # It gets the time of the scene that is read, which may be replaced meanwhile.
     time = file.stat().st_mtime_ns
@@ -122,17 +99,17 @@ def _written_at(file: Path) -> int:
     return file.stat().st_mtime_ns if file.is_file() else 0
 
 
-def edit_scene(scene: StudioScene, settings: Version) -> dict[str, Any]:
-    """Write the edited scene and its page.
+def edit_scene(scene: StudioScene, version: str) -> dict[str, Any]:
+    """Write the edited scene and its page. ``version``: the scene that a page shows; "": any.
 
     Raises: UserError: the scene is not finished, is being made, or was changed since then.
     """
-    return _edit(scene, settings.version, scene.page_edit())
+    return _edit(scene, version, scene.page_edit())
 
 
-def undo_edit(scene: StudioScene, settings: Version) -> dict[str, Any]:
+def undo_edit(scene: StudioScene, version: str) -> dict[str, Any]:
     """Remove the edited scene, and write the page of the other one. Raises: see `edit_scene`."""
-    return _edit(scene, settings.version, None)
+    return _edit(scene, version, None)
 
 
 def _edit(scene: StudioScene, version: str, changes: PageEdit | None) -> dict[str, Any]:
@@ -182,7 +159,7 @@ def finish_edit(scene: StudioScene) -> None:
     scene.begun.unlink()
 
 
-def show_scene(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
+def show_scene(scene: StudioScene, _: str = "") -> dict[str, Any]:
     """Write the site of a finished scene as it is now, and its figures.
 
     Raises: UserError: the scene is not finished.
@@ -209,17 +186,17 @@ def publish_site(scene: StudioScene, file: Path, title: str) -> PublishResult:
     return publish(file, scene.site, PublishOptions(title), overwrite=True)
 
 
-def rename(scene: StudioScene, settings: Title) -> dict[str, Any]:
+def rename(scene: StudioScene, title: str) -> dict[str, Any]:
     """Change the title, also in the site if there is one."""
     if scene.scene_file() is None:
-        scene.change(title=safe_title(settings.title))
+        scene.change(title=safe_title(title))
         return {}
     finish_edit(scene)  # which may have another title
-    scene.change(title=safe_title(settings.title))
+    scene.change(title=safe_title(title))
     return show_scene(scene)
 
 
-def show_whole(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
+def show_whole(scene: StudioScene, _: str = "") -> dict[str, Any]:
     """Write the page that edits a scene whose site has levels of detail, unless it is there.
 
     Raises: UserError: the scene is not finished.

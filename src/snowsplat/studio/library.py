@@ -54,9 +54,8 @@ class Library:
         while True:
             scene = StudioScene(self.folder / (name if number == 1 else f"{name}-{number}"))
             try:
-                scene.folder.mkdir(
-                    mode=0o700
-                )  # the state has the address of a page, with its token
+                # The state has the address of a page, with its token.
+                scene.folder.mkdir(mode=0o700)
                 break
             except FileExistsError:
                 number += 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from snowsplat.evaluation.verdict import Verdict
-from snowsplat.util.messages import Message, as_message, message
+from snowsplat.util.messages import as_message, message
 from snowsplat.util.safe_json import printable
 
 #: What stages count, see `sfm.progress.Report`: `in_languages` finds their Chinese by the English.
@@ -34,9 +34,5 @@ def verdict_in_languages(verdict: Verdict) -> dict[str, object]:
         "grade": verdict.grade,
         "head": in_languages(verdict.head(message("the scene"))),
         "why": [in_languages(why) for why in verdict.why()],
-        "advice": [in_languages(_next_time(advice)) for advice in verdict.advice],
+        "advice": [in_languages(message("next time: {advice}", advice=a)) for a in verdict.advice],
     }
-
-
-def _next_time(advice: Message) -> Message:
-    return message("next time: {advice}", advice=advice)

@@ -50,7 +50,6 @@ from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.messages import Message, message
 from snowsplat.util.own_files import import_own_files
 from snowsplat.util.run_lock import locked
-from snowsplat.util.safe_json import from_json
 
 # Seconds for an edit or export of a killed studio to end.
 _LONGEST_CHANGE = 600.0
@@ -78,7 +77,7 @@ def _outcome(scene: StudioScene, task: str, recorder: Recorder) -> tuple[int, di
         about = message("out of memory; choose draft, or fewer photos")
         return 2, {"outcome": "failed", "error": in_languages(about)}
     except (UserError, OSError) as error:
-        return 2, {"outcome": "failed", "error": in_languages(_message(error))}
+        return 2, {"outcome": "failed", "error": in_languages(message_of(error))}
     except Exception as error:
         traceback.print_exc()
         what = f"{type(error).__name__}: {error}"
@@ -86,10 +85,6 @@ def _outcome(scene: StudioScene, task: str, recorder: Recorder) -> tuple[int, di
             "an unexpected fault: {what}; details are in {log}", what=what, log=scene.log(task)
         )
         return 1, {"outcome": "failed", "error": in_languages(about)}
-
-
-def _message(error: UserError | OSError) -> Message:
-    return message_of(error) if isinstance(error, OSError) else error.message
 
 
 def _make(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
@@ -149,7 +144,7 @@ def _result(scene: StudioScene, made: MakeResult) -> dict[str, Any]:
     }
 
 
-def survey_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
+def survey_photos(scene: StudioScene, _: str = "") -> dict[str, Any]:
     """What `make` would use of the inputs, the seconds that it takes at each quality, and whether
     the photos are few; or the name of the finished scene that was given.
 
@@ -177,7 +172,7 @@ def survey_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
     }
 
 
-def mark_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
+def mark_photos(scene: StudioScene, _: str = "") -> dict[str, Any]:
     """What is wrong with single photos, by the name in `given_photos`: damaged, double, blurred …
 
     Raises: UserError: there is nothing to use.
@@ -207,7 +202,7 @@ def _in_languages(value: Any) -> Any:
     return in_languages(value) if isinstance(value, Message) else value
 
 
-def _preview(scene: StudioScene, settings: Any) -> dict[str, Any]:
+def _preview(scene: StudioScene, _: str) -> dict[str, Any]:
     return {"path": film_preview(changes.finished(scene), scene.film_plan())}
 
 
@@ -216,13 +211,13 @@ class Verb:
     """A short task.
 
     Attributes:
-        run: does it for a scene with its settings; returns the answer.
-        settings: the class of the settings; None: there are none.
+        run: does it for a scene with its setting; returns the answer.
+        setting: the name of its only setting, a text; "": there is none.
         changes: whether it changes files.
     """
 
-    run: Callable[[StudioScene, Any], dict[str, Any]]
-    settings: type | None = None
+    run: Callable[[StudioScene, str], dict[str, Any]]
+    setting: str = ""
     changes: bool = True
 
 
@@ -230,23 +225,23 @@ VERBS = {
     "survey": Verb(survey_photos, changes=False),
     "marks": Verb(mark_photos, changes=False),
     "preview": Verb(_preview, changes=False),
-    "export": Verb(changes.export, changes.Export),
+    "export": Verb(changes.export, "kind"),
     "show": Verb(changes.show_scene),
-    "rename": Verb(changes.rename, changes.Title),
+    "rename": Verb(changes.rename, "title"),
     "whole": Verb(changes.show_whole),
-    "edit": Verb(changes.edit_scene, changes.Version),
-    "undo": Verb(changes.undo_edit, changes.Version),
+    "edit": Verb(changes.edit_scene, "version"),
+    "undo": Verb(changes.undo_edit, "version"),
 }
 _JOBS = {"make": _make, "film": _film}
 
 
 def _answer(verb: Verb, scene: StudioScene, given: dict[str, Any]) -> dict[str, Any]:
-    settings = from_json(verb.settings, given) if verb.settings is not None else None
+    setting = given[verb.setting] if verb.setting else ""
     if not verb.changes:
-        return verb.run(scene, settings)
+        return verb.run(scene, setting)
     scene.kept.mkdir(exist_ok=True, mode=0o700)
     with locked(scene.edit_lock, str(scene.folder), _LONGEST_CHANGE):
-        return verb.run(scene, settings)
+        return verb.run(scene, setting)
 
 
 def main(words: list[str]) -> int:
@@ -259,6 +254,6 @@ def main(words: list[str]) -> int:
     try:
         answer = _answer(VERBS[name], scene, json.loads(settings[0]) if settings else {})
     except (UserError, OSError) as error:
-        answer = {"error": _message(error).as_json()}
+        answer = {"error": message_of(error).as_json()}
     print("\n" + json.dumps(answer))
     return 0

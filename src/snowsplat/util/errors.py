@@ -45,11 +45,13 @@ def cause_of(error: Exception) -> Message:
     return as_message(getattr(error, "strerror", None) or error)
 
 
-def message_of(error: OSError, cause: str | None = None) -> Message:
-    """An error of the system in one line: the file, and what is wrong.
+def message_of(error: UserError | OSError, cause: str | None = None) -> Message:
+    """An error in one line; of the system: the file, and what is wrong.
 
     ``cause``: what is named in place of the file.
     """
+    if isinstance(error, UserError):
+        return error.message
     if not error.filename:
         return cause_of(error)
     return message("{file}: {error}", file=cause or error.filename, error=cause_of(error))

@@ -420,8 +420,7 @@ def test_mouse_touch_and_keys_move_the_camera(page):
 def type_key(page: Page, key: str, code: str, done: Callable[[], bool]) -> None:
     """Type a key until ``done`` is true: with few images per second, Chromium may lose a key."""
     for _ in range(6):
-        for kind in ("keyDown", "keyUp"):
-            page.call("Input.dispatchKeyEvent", type=kind, key=key, code=code)
+        page.key(key, code=code)
         until = time.monotonic() + 10
         while time.monotonic() < until:
             if done():

@@ -73,11 +73,6 @@ def click(page: Page, text: str) -> None:
     page.evaluate(f"{buttons}.find(b => b.textContent === '{text}').click()")
 
 
-def press(page: Page, key: str) -> None:
-    for kind in ("keyDown", "keyUp"):
-        page.call("Input.dispatchKeyEvent", type=kind, key=key, code=f"Key{key.upper()}", text=key)
-
-
 @pytest.mark.browser
 def test_the_panel(file, scene):
     start, stops = (
@@ -104,7 +99,7 @@ def test_the_panel(file, scene):
         page.drag(100, 280, 180, 290)
         assert page.evaluate(MODE) == "orbit"
         # Frame: the camera looks at the subject, which fits into the window.
-        press(page, "f")
+        page.key("f")
         x, y, z = scene.stops.middle.tolist()
         to_subject = (
             f"(e => {{ const p = e.getPosition(), f = e.forward;"
@@ -119,14 +114,14 @@ def test_the_panel(file, scene):
         click(page, "Copy link")
         link = page.wait_for("location.hash", 10)
         shown = pose_of([float(number) for number in link.removeprefix("#view=").split(",")])
-        press(page, "r")
+        page.key("r")
         wait_for_pose(page, pose_of(start[0]))
     with opened(file, 300, 400, link) as page:
         wait_for_pose(page, shown)
         # Another link in the same tab.
         page.evaluate(f"location.hash = '#view={','.join(map(str, stops[5]))}'")
         wait_for_pose(page, pose_of(stops[5]))
-        press(page, "r")
+        page.key("r")
         # Links that are no views.
         for link in ("#", "#view=1,1,1,1,1,1,50", "#view=a,b,c,d,e,f,g", "#view=0,0,0,1,1,1,0"):
             wait_for_pose(page, pose_of(start[0]))
@@ -140,10 +135,7 @@ def test_windows_of_any_shape_show_the_complete_photo(file, scene):
     component = f"{ENTITY}.camera"
     with opened(file, 480, 360) as page:
         for width, height in ((600, 300), (300, 600), (480, 360)):
-            size = {"width": width, "height": height}
-            page.call(
-                "Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=False
-            )
+            page.resize(width, height)
             camera = scene.start.camera(width, height)
             fov = math.degrees(2 * math.atan(max(width, height) / 2 / camera.fx))
             page.wait_for(f"Math.abs({component}.fov - {fov}) < 0.01", 30)
@@ -177,8 +169,7 @@ def test_a_window_shows_no_more_than_the_photos_do(scene, tmp_path):
             page.wait_for(f"Math.abs({shown}[1] - {times * across}) < 0.01", 30)
             camera = shown_at(stops, i, 600, 300)
             assert 300 / camera.fx == pytest.approx(times * across)
-        size = {"width": 300, "height": 600}
-        page.call("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=False)
+        page.resize(300, 600)
         page.wait_for(f"{shown}[0] < 0.6", 30)
         # The photos show its height only, but the core is as wide as half of it.
         page.wait_for(f"Math.abs({shown}[1] - {across}) < 0.01", 30)
@@ -264,6 +255,16 @@ def test_a_browser_that_is_too_old_is_told_so(file):
 def test_a_click_on_every_control(file):
     """Leaves no error in the console. The film is the last one; dragging ends it in orbit."""
     with opened(file, 600, 400) as page:
+        # The keyboard reaches hidden controls and the switches, whose keys are not for the film.
+        page.evaluate("window.sse.viewer.state.controlsHidden = true")
+        page.key("Tab")
+        assert page.evaluate("!!document.activeElement.closest('.sse-controlsWrap')")
+        switch = "document.querySelector('.sse-performanceModeCheck')"
+        page.evaluate(f"document.querySelector('.sse-settings').click(), {switch}.focus()")
+        before = page.evaluate(f"{switch}.ariaChecked")
+        page.key(" ")
+        page.wait_for(f"{switch}.ariaChecked !== '{before}'")
+        assert page.evaluate(MODE) == "orbit"
         shown = "[...document.querySelectorAll('.sse-viewer button')].filter(b => b.offsetParent)"
         clicked = set()
         while True:
@@ -282,7 +283,7 @@ def test_a_click_on_every_control(file):
         named = ("flyCamera", "settings", "frame", "reset", "controlsButton", "info", "infoClose")
         assert {f"sse-{name}" for name in named} <= clicked
         for key in "12ghfr":
-            press(page, key)
+            page.key(key)
         page.evaluate("document.querySelector('.sse-orbitCamera').click()")
         page.evaluate("document.querySelector('.sse-play').click()")
         assert page.evaluate(MODE) == "anim"

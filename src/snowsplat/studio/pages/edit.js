@@ -6,6 +6,7 @@ import { DELETED, Edits, SELECTED } from "./edits.js";
 import { addLevel } from "./level.js";
 import { addNotes, notesOf } from "./notes.js";
 import { addOverlay } from "./overlay.js";
+import { addCursor } from "./cursor.js";
 import { icon } from "./icons.js";
 import { button, make } from "./page.js";
 import { painter } from "./painting.js";
@@ -142,6 +143,7 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
     function draw() {
         overlay.clear();
         tools.get(tool)?.draw?.();
+        cursor.draw();
     }
     const change =
         (/** @type {(event?: any) => void} */ run) =>
@@ -155,10 +157,11 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
 
     // The tools
 
-    const choices = (/** @type {string[]} */ names, /** @type {(name: string) => void} */ choose) => {
-        const buttons = names.map(name =>
-            name in KEYS ? keyButton(name, () => choose(name)) : button(`edit_${name}`, () => choose(name)),
-        );
+    const choices = (/** @type {string[]} */ names, /** @type {(name: string, isKey: boolean) => void} */ choose) => {
+        const buttons = names.map(name => {
+            const click = (/** @type {MouseEvent} */ event) => choose(name, event.detail === 0);
+            return name in KEYS ? keyButton(name, click) : button(`edit_${name}`, click);
+        });
         const mark = (/** @type {string} */ chosen) =>
             buttons.forEach((each, i) => (each.ariaPressed = String(names[i] === chosen)));
         return { buttons, mark };
@@ -210,13 +213,21 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
         }),
     );
     const forTools = new Set(tools.values());
-    const toolButtons = choices([...tools.keys()], name => choose(tool === name ? "" : name));
-    function choose(/** @type {string} */ name) {
+    const cursor = addCursor(overlay, () => Boolean(tools.get(tool)?.press));
+    const toolButtons = choices([...tools.keys()], (name, isKey) => choose(tool === name ? "" : name, isKey));
+    /** `isKey`: without a mouse; the arrow keys then move a cross, see cursor.js. */
+    function choose(/** @type {string} */ name, isKey = false) {
+        const last = [...tools.keys()].indexOf(tool);
+        const hadFocus = document.activeElement === overlay.element;
         const chosen = tools.get((tool = name));
         toolButtons.mark(name);
         overlay.element.hidden = !name;
         // Without a use for the pointer, it moves the camera.
-        overlay.element.style.pointerEvents = chosen?.press || chosen?.point ? "auto" : "none";
+        const usesPointer = Boolean(chosen?.press || chosen?.point);
+        overlay.element.style.pointerEvents = usesPointer ? "auto" : "none";
+        overlay.element.tabIndex = usesPointer ? 0 : -1;
+        if (usesPointer && isKey) overlay.element.focus();
+        else if (hadFocus) toolButtons.buttons[last]?.focus();
         forSelection.hidden = ["measure", "note", "level"].includes(name);
         for (const each of forTools) {
             each.element.hidden = each !== chosen;
@@ -314,7 +325,8 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
             else if (command && key === "y") change(() => go("redo"))();
             else if (key === "delete" || key === "backspace") change(() => edits.delete())();
             else if (key === "escape" && tool) choose("");
-            else if (!command && !event.altKey && LETTERS.has(key)) choose(/** @type {string} */ (LETTERS.get(key)));
+            else if (!command && !event.altKey && LETTERS.has(key))
+                choose(/** @type {string} */ (LETTERS.get(key)), true);
             else return;
             event.preventDefault();
             event.stopPropagation();

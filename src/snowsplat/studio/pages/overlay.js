@@ -2,6 +2,7 @@
 
 import { make } from "./page.js";
 import { project } from "./selection.js";
+import { say } from "./text.js";
 
 /** A colour of `theme.css`. */
 export const colour = (/** @type {string} */ name) =>
@@ -9,7 +10,9 @@ export const colour = (/** @type {string} */ name) =>
 
 /** @param {HTMLCanvasElement} canvas of the viewer */
 export function addOverlay(canvas) {
-    const element = /** @type {HTMLCanvasElement} */ (make("canvas.snow-overlay", { hidden: true }));
+    const element = /** @type {HTMLCanvasElement} */ (
+        make("canvas.snow-overlay", { hidden: true, role: "application", "aria-label": say("edit_cross") })
+    );
     const drawing = /** @type {CanvasRenderingContext2D} */ (element.getContext("2d"));
     canvas.after(element);
     // Zoom works with every tool.

@@ -91,10 +91,26 @@ export function notice(text) {
 /** @type {ReturnType<typeof setTimeout> | undefined} */
 let hiding;
 
+/**
+ * Gives the focus of the keyboard back if its element was disabled or is gone: to that element, to what
+ * has its name now, to what is at its place, or to the page.
+ */
+function focusAgain(/** @type {HTMLElement} */ last, /** @type {HTMLElement | null} */ place) {
+    const main = /** @type {HTMLElement} */ (document.getElementById("main"));
+    if (document.activeElement !== document.body && document.activeElement !== main) return;
+    const name = (/** @type {HTMLElement} */ each) => [each.textContent, each.ariaLabel].join();
+    const all = /** @type {HTMLElement[]} */ ([...main.querySelectorAll(last.tagName)]);
+    const same = last.isConnected ? last : all.find(each => name(each) === name(last));
+    const near = place?.isConnected && place.querySelector("button");
+    (same || near || main).focus({ preventScroll: true });
+}
+
 /** Runs an action of a button, which is disabled meanwhile; tells an error. */
 export function action(/** @type {() => Promise<any>} */ run) {
     return async (/** @type {Event} */ event) => {
         const button = /** @type {HTMLButtonElement} */ (event.currentTarget);
+        const focused = /** @type {HTMLElement} */ (document.activeElement);
+        const place = focused.parentElement;
         event.preventDefault();
         button.disabled = true;
         try {
@@ -103,6 +119,7 @@ export function action(/** @type {() => Promise<any>} */ run) {
             notice(reasonOf(error));
         } finally {
             button.disabled = false;
+            if (focused !== document.body) focusAgain(focused, place);
         }
     };
 }

@@ -92,7 +92,9 @@ export class ScenePage {
             this.update = undefined;
             const part = PARTS[parts] ?? stoppedPart;
             const kept = WITHOUT_NAME.includes(parts) ? [] : [keptPart(this, scene)];
+            const hadFocus = this.body.contains(document.activeElement);
             this.body.replaceChildren(...part(this, scene).filter(each => each !== false), ...kept);
+            if (hadFocus) document.getElementById("main")?.focus({ preventScroll: true });
         }
         this.update?.(scene);
     }

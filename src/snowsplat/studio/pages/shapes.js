@@ -57,7 +57,7 @@ export function addShapes({ canvas, centers, overlay, model, select }) {
             element.hidden = name !== "brush";
         },
         press(/** @type {PointerEvent} */ event) {
-            overlay.element.setPointerCapture(event.pointerId);
+            if (event.isTrusted) overlay.element.setPointerCapture(event.pointerId); // the keyboard has none
             stroke = [[event.offsetX, event.offsetY]];
         },
         draw() {

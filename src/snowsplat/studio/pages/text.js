@@ -241,8 +241,12 @@ const TEXTS = {
     edit_scene: ["Scene", "场景"],
     edit_help: ["Help", "帮助"],
     edit_keys: [
-        "Shift adds to the selection, Alt subtracts from it, Esc leaves a tool; then the mouse moves the camera.",
-        "按住 Shift 加选，按住 Alt 减选；按 Esc 退出工具，之后鼠标移动相机。",
+        "Shift adds to the selection, Alt subtracts from it, Esc leaves a tool; then the mouse moves the camera. Without a mouse, the arrow keys move a cross, and Enter presses and releases it.",
+        "按住 Shift 加选，按住 Alt 减选；按 Esc 退出工具，之后鼠标移动相机。没有鼠标时，方向键移动十字光标，Enter 键按下和松开。",
+    ],
+    edit_cross: [
+        "Cross: the arrow keys move it, Enter presses and releases it",
+        "十字光标：方向键移动，Enter 键按下和松开",
     ],
     edit_units: ["{0} units", "{0} 单位"],
     edit_mode: ["The next selection", "下一次选择"],

@@ -27,6 +27,7 @@ from snowsplat.training.settings.density import (
 )
 from snowsplat.training.step.optim import Adam
 from snowsplat.training.step.view_gradient import ViewGradient
+from snowsplat.util.overrides import check_overrides
 
 __all__ = [
     "DENSITY_CONTROLS",
@@ -94,9 +95,12 @@ def density_control(settings: Any, count: int, **state: Any) -> DensityControl:
             training starts from random points instead of SfM points; generator, a random generator
             on the CPU; device, of the Gaussians, default: the CPU; shards, the processes of the
             training, default: this one alone.
+
+    Raises: UserError: see `check_overrides`.
     """
     if hasattr(settings, "control"):
         made: DensityControl = settings.control(count, **state)
+        check_overrides(type(made), DensityControl)
         return made
     begin = next(begin for kind, begin in _STATES.items() if isinstance(settings, kind))
     return begin(settings, count, **state)

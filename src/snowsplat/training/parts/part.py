@@ -32,6 +32,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import RenderOutput
 from snowsplat.training.step.batch import Batch, BatchView, Gradients
 from snowsplat.util.messages import Message
+from snowsplat.util.overrides import check_overrides
 
 if TYPE_CHECKING:  # these modules import this one
     from snowsplat.training.core.run import Run
@@ -110,9 +111,11 @@ class Part:
     idle: bool = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Raises: UserError: see `check_overrides`."""
         super().__init_subclass__(**kwargs)
         if "name" not in vars(cls):
             cls.name = cls.__name__
+        check_overrides(cls, Part)
 
     # Once, before the first step
 

@@ -128,6 +128,7 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
 
     if (!options.ui) return;
     nameSigns();
+    openSwitches();
     Object.assign(canvas, { role: "img", ariaLabel: scene.title });
     const toggle = (label, content) => {
         const button = element("button", {
@@ -206,16 +207,18 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
         hiding.element,
         strip,
     );
-    // Keys for the buttons and sliders of the panel are not for the camera.
-    panel.addEventListener("keydown", event => {
-        if ([" ", "Enter"].includes(event.key) || event.target.type === "range") event.stopPropagation();
-    });
     events.on("controlsHidden:changed", hidden =>
         panel.classList.toggle("snow-faded", hidden && strip.hidden && hiding.element.hidden),
     );
     const viewerElement = document.querySelector(".sse-viewer");
     viewerElement.role = "main";
     viewerElement.append(panel);
+    // Keys for buttons and sliders are not for the camera.
+    viewerElement.addEventListener("keydown", event => {
+        if ([" ", "Enter"].includes(event.key) || event.target.type === "range") event.stopPropagation();
+    });
+    // The controls that have been hidden come back before the focus moves, as for the mouse.
+    window.addEventListener("keydown", event => event.key === "Tab" && events.fire("inputEvent", "tab"), true);
     events.on("loaded:changed", () => document.querySelector(".snow-failure")?.remove());
     // The studio adds its tools.
     const frame = times => flyTo(subjectView(times));

@@ -60,3 +60,21 @@ const nameSigns = () => {
     }
     for (const sign of document.querySelectorAll(".sse-viewer svg")) sign.setAttribute("aria-hidden", "true");
 };
+
+/** The switches of the viewer's settings are for the mouse only; here they get the keyboard, too. */
+const openSwitches = () => {
+    for (const each of document.querySelectorAll(".sse-toggleSwitch")) {
+        const label = each.previousElementSibling.textContent;
+        Object.assign(each, { role: "switch", tabIndex: 0, ariaLabel: label });
+        const tell = () => {
+            each.ariaChecked = String(each.classList.contains("sse-active"));
+        };
+        new MutationObserver(tell).observe(each, { attributeFilter: ["class"] });
+        tell();
+        each.addEventListener("keydown", event => {
+            if (![" ", "Enter"].includes(event.key)) return;
+            event.preventDefault(); // the space bar would scroll
+            each.click();
+        });
+    }
+};
