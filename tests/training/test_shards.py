@@ -20,7 +20,7 @@ from ..ports import unused_port
 
 WORKER = Path(__file__).with_name("shards_worker.py")
 # All kinds of density control and of hooks between the steps; the last batch has fewer views.
-DENSE = {"iterations": 62, "densify_from": 10, "densify_interval": 10, "max_gaussians": 900}
+DENSE = {"iterations": 42, "densify_from": 10, "densify_interval": 10, "max_gaussians": 900}
 RUNS = [
     {
         **DENSE,
@@ -35,7 +35,7 @@ RUNS = [
         **DENSE,
         "batch": 3,
         "name": "mcmc-short",
-        "densify_until": 50,
+        "densify_until": 35,
         "test_iterations": (25,),
         "refine_poses": True,
         "antialias": True,
