@@ -12,8 +12,6 @@ fog if the mean depth of the scene is less than 0.8 of the true one, and the col
 The time is that of the training and of the measure. OUT gets the photos and the images.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import math

@@ -7,8 +7,6 @@ The photos are ray traced (`benchmarks/street.py`). Every 8th is held out. Each 
 process of its own, whose memory is measured. Results are kept in OUT; the same command continues.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -9,8 +9,6 @@ Ray-traced photos of a still life in a room, with the true poses and noisy point
 motion finds them. The true depth of the held-out photos is compared with the rendered one.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

@@ -15,8 +15,6 @@ ports (AMD Zen 5) can reach a ratio above 1. The clock is that reported by the s
 virtual machines rarely report the true one.
 """
 
-from __future__ import annotations
-
 FORWARD = {
     "log₂α = (A X + p₁) X + p₀": 2,
     "2^x: fraction, polynomial of degree 4, scale": 6,

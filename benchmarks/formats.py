@@ -9,8 +9,6 @@ training, two mean PSNRs are computed over the cameras of every 8th photo: rende
 that was read back compared with renderings of SCENE, and with the photos.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import tempfile

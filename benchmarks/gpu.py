@@ -14,8 +14,6 @@ figures, OUT/gpu.log the output of the parts. Exit code: 0 on success, 1 if some
 exceeded its time, 2 without a GPU.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

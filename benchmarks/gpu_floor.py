@@ -12,8 +12,6 @@ Both rates are measured on the card (`gpu_parts.py device`). The bound is that o
 the kernels: a kernel that transfers data twice has a lower ratio floor / time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from snowsplat.util.native_layout import TILE

@@ -4,8 +4,6 @@ Scenes are small and have odd sizes, so blocks, warps and tiles are incomplete e
 run in both dtypes, with gradient sums by atomics and in a fixed order. Then a training step runs.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable

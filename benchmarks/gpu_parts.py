@@ -4,8 +4,6 @@ It imports only those modules of the package that need no other packages than Py
 and cuda-bindings.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

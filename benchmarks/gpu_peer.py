@@ -6,8 +6,6 @@ step uses our fused loss and PyTorch's fused Adam. gsplat has two memory layouts
 counts.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """The findings of `gpu.py` as a page of Markdown. This module only needs Python."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 

@@ -4,8 +4,6 @@ The steps are those of `Trainer.step_once`. Learning rates are 0, so the workloa
 and all repetitions do the same work.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 import time

@@ -7,8 +7,6 @@ turned and scaled a little, onto a square of ground. `convert` then writes the l
 a process of its own, and `view` shows them in a headless Chromium, which has no GPU here.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import os

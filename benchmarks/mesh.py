@@ -12,8 +12,6 @@ the plain method: depths that no photo confirms, in the field of the PyTorch ref
 Open3D's surface of the points.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import time

@@ -1,7 +1,5 @@
 """Datasets of procedural scenes with exact poses, and true points on their surfaces."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ repeated, so the same command resumes. Prints the table of docs/learn/from-paper
 mean over the seeds, minus that of `default`.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import statistics

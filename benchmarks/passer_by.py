@@ -1,7 +1,5 @@
 """A person who walks through the room of the still life, for photos with something that moves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 

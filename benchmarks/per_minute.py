@@ -11,8 +11,6 @@ load before each run is written beside its result. A run that is in OUT is not r
 Writes OUT/per_minute.json, .md and .svg.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

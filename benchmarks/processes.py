@@ -7,8 +7,6 @@ updates are not measured. The memory is that without Python and its libraries. T
 sent is compared with the model of `sent_bytes`.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import json

@@ -1,7 +1,5 @@
 """The report of `recipes.py`: one table, curves over processor time, and the worst views."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The request is a JSON file: {"dataset", "resolution", "hold_out", "recipe", "set
 "milestones", "pictures"}. The result is printed as JSON on standard output.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

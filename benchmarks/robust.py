@@ -11,8 +11,6 @@
 The points are those of the true surfaces, with an error of about a pixel.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 from collections.abc import Sequence

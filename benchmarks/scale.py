@@ -8,8 +8,6 @@ has, and the backward pass of the projection. So is the rate at which two proces
 exchange data. See docs/what-was-tried.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import os

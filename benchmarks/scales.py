@@ -6,8 +6,6 @@ Each OUT is the output folder of a training with --eval. Its held-out photos are
 original files. So for larger images, train on reduced photos: with -r 4, up to four times the size.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -18,8 +18,6 @@ most photos (`sfm_placed.py`). A photo is placed correctly if the error of its r
 than 3°, and that of its centre less than 3% of the largest distance between two true centres.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -4,8 +4,6 @@ Each function returns ``cam_from_world`` (3, 4) float64 of ``count`` photos, in 
 the floor is at z = 0. Equal arguments return equal paths.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Compares the poses of a model with the true poses: which photos are placed correctly."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping

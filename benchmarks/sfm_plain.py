@@ -7,8 +7,6 @@ FOLDER/sparse, and one line of JSON to standard output: wall time, processor tim
 of photos of all models.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

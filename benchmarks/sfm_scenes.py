@@ -16,8 +16,6 @@ Lengths are in metres, and z is up. The floor is at z = 0, except in "around". T
 the seed.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import sys

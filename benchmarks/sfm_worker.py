@@ -9,8 +9,6 @@ processes.
 Only `make_dataset` and its progress are used, so the process can run other builds of the package.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -4,8 +4,6 @@ Metres; x is along the street, z is up, and the middle of the road is y = 0. All
 the seed. The sky and a distant skyline are painted on a dome.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

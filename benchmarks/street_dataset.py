@@ -1,7 +1,5 @@
 """A dataset of the procedural street: photos of a walk, exact poses, and points on the surfaces."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

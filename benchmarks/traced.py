@@ -3,8 +3,6 @@
 `depth_map` and `distances` are exact, too.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Sequence

@@ -8,8 +8,6 @@ Writes OUT/DATASET.csv, .json and .svg. The clock is stopped while held-out view
 time includes the initialisation of the Gaussians.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import csv

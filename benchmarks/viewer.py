@@ -8,8 +8,6 @@ The browser is replaced by a client that receives the images but does not draw t
 browser may run on another machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import json

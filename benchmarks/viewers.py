@@ -13,8 +13,6 @@ then that of `snowsplat demo`.
 Nothing is loaded from the network. The viewers draw with a GPU in software, which takes a while.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json

@@ -6,8 +6,6 @@ A request is a line of JSON on standard input, the response is a line on standar
 Between requests, the process sleeps.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from typing import Any

@@ -7,8 +7,6 @@ procedural courtyard with similar statistics is used, and `Workload.source` says
 two must not be compared.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import os

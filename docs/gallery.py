@@ -8,8 +8,6 @@ one file in build/gallery, which `make docs` copies into the site if it is there
 docs/pictures. Nothing is made that is there already.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Callable

@@ -13,8 +13,6 @@ moving picture: the scene in a snow globe), web.webp and live.webp (the two view
 (the report of the training).
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

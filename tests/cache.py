@@ -1,7 +1,5 @@
 """Stores expensive inputs of tests, which depend only on source files, between runs."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -4,8 +4,6 @@
 describes them.
 """
 
-from __future__ import annotations
-
 import gc
 import logging
 import os

@@ -1,7 +1,5 @@
 """The examples of docs/guides/research.md: they are short, they run, and they survive kill -9."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

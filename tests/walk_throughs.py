@@ -6,8 +6,6 @@ content of a new file (after "Create `path`:"), or changes of a file (`diff`, af
 must occur exactly once.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from pathlib import Path

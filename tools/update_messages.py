@@ -4,8 +4,6 @@ There is one file for each package. New messages have an empty text, which a tra
 texts of messages that no longer exist are removed. A message that moves keeps its text.
 """
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`snowsplat benchmark`: protocols, tables, interrupted and failed scenes, locks."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -1,7 +1,5 @@
 """`image`: the files of a fit, compact files as input, invalid input."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import xml.etree.ElementTree as ElementTree

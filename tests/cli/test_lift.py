@@ -1,7 +1,5 @@
 """`lift`: the files, the subcommands that read them, focal lengths, refinement, invalid input."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

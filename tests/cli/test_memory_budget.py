@@ -1,7 +1,5 @@
 """`--memory`: a dataset that is four times as large as the allowed memory."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Zip files around scenes, projects of SuperSplat, checkpoints of gsplat, folders of SOG."""
 
-from __future__ import annotations
-
 import json
 import math
 import zipfile

@@ -1,8 +1,6 @@
 """Values at the edge: opacities of 0 and 1, flat axes, values beyond the range of a format, and the
 variants of PLY that other trainers write."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """USD files: what OpenUSD reads in them, and what is read of those of other programs."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from dataclasses import replace

@@ -4,8 +4,6 @@ Each format is one entry in `READERS`. The tests in this folder damage the files
 tests/nightly/fuzz_files.py does so for hours.
 """
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import functools

@@ -6,8 +6,6 @@ have their final names. Then it runs the same command to its end, which must hav
 the correct result.
 """
 
-from __future__ import annotations
-
 import base64
 import fcntl
 import hashlib

@@ -1,7 +1,5 @@
 """The interactive figure of docs/learn/initialisation.md, in a real browser."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -4,8 +4,6 @@ They are a part of the documentation, not of the package: only whether they work
 change, in both languages; what they show, at night.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json

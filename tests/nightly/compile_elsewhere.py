@@ -7,8 +7,6 @@ The compiler is Zig, which contains Clang, the headers of macOS, and those of Mi
 MSVC. The exit code is 1 if something does not compile.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

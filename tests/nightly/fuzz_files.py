@@ -9,8 +9,6 @@ the log and the file are in --findings. `SNOWSPLAT_FUZZ=20000 python -m pytest t
 files at random instead.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

@@ -11,8 +11,6 @@ plan. At no time do two processes make one scene. The last line counts the kills
 1 if something was lost or done twice.
 """
 
-from __future__ import annotations
-
 import argparse
 import base64
 import collections

@@ -11,8 +11,6 @@ lists them, with the reason for each. The script needs the extra "nightly" and a
 exit code is 1 if the tests of a part detect less than 90% of the faults in it.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import sys

@@ -11,8 +11,6 @@ compiler. The exit code is 1 if less than 90% of the faults are detected, or if 
 match the sources.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

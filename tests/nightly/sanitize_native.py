@@ -8,8 +8,6 @@ the threads.
 It needs g++ with its sanitizers. The exit code is 1 if anything is found.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

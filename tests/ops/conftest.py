@@ -1,7 +1,5 @@
 """Fixtures that run one test body over the implementations of the ops."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 

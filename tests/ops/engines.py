@@ -1,7 +1,5 @@
 """Runs GPU kernels with CPU tensors, so that a test works for every engine."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

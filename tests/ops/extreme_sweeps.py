@@ -1,7 +1,5 @@
 """Extreme input of `plane_sweep` by hypothesis, and its check against the float64 reference."""
 
-from __future__ import annotations
-
 import math
 
 import torch

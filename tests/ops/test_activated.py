@@ -1,7 +1,5 @@
 """`project_activated`: the reference, for any count; invalid input. See also `rasterization`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import ModuleType
 from typing import Any

@@ -1,7 +1,5 @@
 """`adam_step`: known properties of Adam, and native against the reference."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """`camera_gradient`: the backward pass of `project` to the pose and the focal length."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """GPU kernels compiled by NVRTC for each architecture; no GPU is needed."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import re

@@ -1,7 +1,5 @@
 """The native ops are bit-identical for any number of threads and in every run."""
 
-from __future__ import annotations
-
 import functools
 import sys
 from collections.abc import Iterator, Sequence

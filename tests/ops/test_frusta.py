@@ -1,7 +1,5 @@
 """`points_in_frusta`, `points_in_spheres`: known positions, and native against the reference."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """`fuse_depth`: known distances, and native against the reference."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

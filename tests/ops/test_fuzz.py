@@ -4,8 +4,6 @@ The search by hypothesis takes seconds here. With SNOWSPLAT_FUZZ=20000, it draws
 each check, others in each run (or those of `--hypothesis-seed`), and a fiftieth on the emulation.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable

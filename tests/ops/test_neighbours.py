@@ -1,7 +1,5 @@
 """`neighbours`: known distances, and native against the reference."""
 
-from __future__ import annotations
-
 import functools
 import math
 

@@ -1,7 +1,5 @@
 """`add_noise`: its random numbers, known values, the reference, extreme rows, wrong input."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

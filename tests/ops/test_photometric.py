@@ -1,7 +1,5 @@
 """`ssim` and `photometric_loss`: closed forms, a loop, finite differences, native and reference."""
 
-from __future__ import annotations
-
 import functools
 import math
 

@@ -1,7 +1,5 @@
 """`plane_sweep`: known disparities, a slanted plane, and native against the reference."""
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any

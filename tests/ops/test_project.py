@@ -1,7 +1,5 @@
 """`project`: closed forms, visibility, finite differences, and native against the reference."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

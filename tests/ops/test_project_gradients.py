@@ -1,7 +1,5 @@
 """`add_project_gradients`: the backward pass of `project`, summed over views."""
 
-from __future__ import annotations
-
 import functools
 import math
 from types import SimpleNamespace

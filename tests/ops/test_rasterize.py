@@ -1,7 +1,5 @@
 """`rasterize`: closed forms, a per-pixel loop, finite differences, agreement of the engines."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable

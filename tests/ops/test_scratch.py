@@ -1,7 +1,5 @@
 """The pool of memory: tensors do not overlap, and freed memory is used again."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

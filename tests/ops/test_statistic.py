@@ -1,7 +1,5 @@
 """The densification statistics: a closed form, the reference, threads, wrong input."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Sorting splats into tiles on a GPU: radix sort, prefix sums, tile lists."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter

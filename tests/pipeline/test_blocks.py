@@ -1,7 +1,5 @@
 """`blocks`: cells, the datasets of blocks, training in any order, merging."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

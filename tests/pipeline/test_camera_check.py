@@ -1,7 +1,5 @@
 """A training refuses impossible cameras before it writes anything, unless they are trusted."""
 
-from __future__ import annotations
-
 import logging
 import re
 from dataclasses import replace

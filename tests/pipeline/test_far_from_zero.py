@@ -1,7 +1,5 @@
 """A dataset in UTM coordinates: where a scene and a dataset meet, and where cameras are written."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A training whose folder or dataset was moved, and photos that are edited before `resume`."""
 
-from __future__ import annotations
-
 import os
 import shutil
 

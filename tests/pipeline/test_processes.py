@@ -1,7 +1,5 @@
 """`train --processes` and `torchrun`: the same files as one process; a process that ends."""
 
-from __future__ import annotations
-
 import os
 import random
 import re

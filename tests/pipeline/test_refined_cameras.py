@@ -1,7 +1,5 @@
 """Training with refined cameras: the lines, the files, and what uses them later."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

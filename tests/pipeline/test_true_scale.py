@@ -1,7 +1,5 @@
 """The true scale: known from a distance, and kept by every way through files."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What belongs together in a folder: by the place of the files, or by the record of `make`."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """The depth of a ray-traced scene: exact, as tests and benchmarks compare it."""
 
-from __future__ import annotations
-
 import numpy as np
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Cameras of the ray tracer besides that of a phone: a fisheye lens, and a 360° panorama."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar

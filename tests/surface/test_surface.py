@@ -1,7 +1,5 @@
 """Depth maps, their fusion, and triangles of a sphere and of flat Gaussians."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 

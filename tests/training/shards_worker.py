@@ -6,8 +6,6 @@ RUNS is a list of keyword arguments of `recipe`, as JSON. For each of them, proc
 state, the losses, the PSNR of the test views, and the number of bytes that each process has sent.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

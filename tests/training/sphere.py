@@ -1,7 +1,5 @@
 """A sphere in six photos of one grey each, with its depth maps in files."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

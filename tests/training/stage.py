@@ -1,7 +1,5 @@
 """`stage`: what a part needs of a training run, without a dataset on disk."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any

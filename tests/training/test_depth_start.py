@@ -1,7 +1,5 @@
 """The start from depth maps of the dataset: kinds of values, alignment, masks, unusable maps."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from pathlib import Path

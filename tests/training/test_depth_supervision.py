@@ -1,7 +1,5 @@
 """Depth maps in the loss: the term, a scene without texture, maps that are wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exposures of photos: their estimate, the photos without them, and the gains that are learnt."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from dataclasses import replace

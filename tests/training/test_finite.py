@@ -1,7 +1,5 @@
 """Values that are not finite: training stops, names them, and never stores them."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

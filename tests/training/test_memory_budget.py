@@ -1,7 +1,5 @@
 """Estimates of the memory of a training run, sizes as text, and reductions to fit a budget."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`misalignment`: photos that are shifted against their renderings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

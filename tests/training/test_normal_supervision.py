@@ -1,7 +1,5 @@
 """Normal maps in the loss: the term, the axes of a map, maps that are wrong."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Parts, losses and rows that a user adds: their effect, and their place in checkpoints."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

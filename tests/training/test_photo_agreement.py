@@ -1,7 +1,5 @@
 """Whether other photos confirm a photo, at the depth of the scene."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

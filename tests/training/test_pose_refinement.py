@@ -1,7 +1,5 @@
 """Camera poses that are optimised with the scene: coordinates, gradients, training, checkpoints."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

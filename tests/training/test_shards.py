@@ -1,7 +1,5 @@
 """Training in several processes: the same bits as in one process, for each density control."""
 
-from __future__ import annotations
-
 import json
 import sys
 from itertools import pairwise

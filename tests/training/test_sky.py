@@ -1,7 +1,5 @@
 """The sky: where photos show it, points there, and none before it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

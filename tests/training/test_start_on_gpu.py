@@ -2,8 +2,6 @@
 of the CPU.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The starts that need no points: random rays; the choice of starts."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 The complete step on the kernels of a GPU is in `test_trainer_gpu`.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

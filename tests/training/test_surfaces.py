@@ -1,7 +1,5 @@
 """Flat Gaussians, and the consistency of their normals with the depth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Dense initialisation: source views, depth maps by plane sweep, fusion into points."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Training on a GPU: its kernels emulated on the CPU, fake GPU tensors, and a GPU if present."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Things that are in only one photo are masked there, and a static scene is trained as before."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The unit of a dataset does not matter: scaled by a power of two, it trains to the same scene."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

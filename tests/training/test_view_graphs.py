@@ -1,7 +1,5 @@
 """Recorded gradients: on the CPU, a recording runs the same Python code again on its own memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The smoothing spline: its known mathematical properties."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """One run per folder: waiting, messages, killed processes, and removed locks."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

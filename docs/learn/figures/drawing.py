@@ -8,8 +8,6 @@ dark, the text remains readable. On the site, the figures are elements of the pa
 Panels are at most 340 units wide. So they are shown at their full size on a phone, too.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import math

@@ -1,7 +1,5 @@
 """`snowsplat benchmark`: all scenes of a benchmark suite, and a table."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

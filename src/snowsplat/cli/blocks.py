@@ -1,7 +1,5 @@
 """`snowsplat blocks`: a scene that is larger than the memory, in blocks that are merged."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

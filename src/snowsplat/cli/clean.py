@@ -1,7 +1,5 @@
 """`snowsplat clean`: a scene without floaters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

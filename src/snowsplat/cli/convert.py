@@ -1,7 +1,5 @@
 """`snowsplat convert`: a scene in another format, or edited."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

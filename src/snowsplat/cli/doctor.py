@@ -1,7 +1,5 @@
 """`snowsplat doctor`: the machine and the installation, and what is missing."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

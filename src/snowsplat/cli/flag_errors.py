@@ -10,8 +10,6 @@ are accepted, see `reference_flags`; only the name of its `convert.py` is that o
 here.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """`snowsplat info`: the contents of a file or folder."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`snowsplat mesh` and `points`: the surfaces of a scene as triangles, or as dense points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

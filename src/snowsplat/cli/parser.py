@@ -1,7 +1,5 @@
 """The arguments of a command line, parsed by tyro from the declarations of a subcommand."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Sequence
 from dataclasses import field, make_dataclass

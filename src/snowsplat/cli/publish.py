@@ -1,7 +1,5 @@
 """`snowsplat publish`: a static web site that shows a scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -6,8 +6,6 @@ effect here, which is said in a line; or it is refused, with what to use instead
 from the reference implementation" shows this table.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

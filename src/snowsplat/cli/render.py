@@ -1,7 +1,5 @@
 """`snowsplat render`: images of a scene from the cameras of its photos, and videos."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal

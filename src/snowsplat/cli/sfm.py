@@ -1,7 +1,5 @@
 """`snowsplat sfm`: photos or a video become a posed dataset."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`snowsplat view`: a finished scene in the browser."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`snowsplat watch`: the output folder of a training run in the browser, finished or running."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from snowsplat.cli.command import Command

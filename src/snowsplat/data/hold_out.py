@@ -1,7 +1,5 @@
 """The images of a dataset that are held out for testing."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

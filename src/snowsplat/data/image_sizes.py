@@ -1,7 +1,5 @@
 """The sizes of the image files of a dataset, against those of their cameras."""
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from dataclasses import dataclass, replace

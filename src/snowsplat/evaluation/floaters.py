@@ -11,8 +11,6 @@ is about 1 on the surface and small in front of it; the sums are over the pixels
 surface.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -14,8 +14,6 @@ exposure or white balance than the scene. It is listed beside the PSNR and never
 `renderings` yields the views of a scene beside their photos, at any of the sizes of `ImageLoader`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """`write_pictures`: pictures and their cameras as a dataset, for `train` and what follows it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -6,8 +6,6 @@ them: position, rotation (xyzw) and scale, in the frame of a PLY turned by 180°
 What is in other zip files is named in the error message.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import struct

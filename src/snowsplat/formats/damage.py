@@ -1,7 +1,5 @@
 """What readers of scene files do with damaged ones: one error, to which `reads` adds the path."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from pathlib import Path

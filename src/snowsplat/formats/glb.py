@@ -5,8 +5,6 @@ the binary chunk of the file, a data URI, or a file inside of the folder of the 
 Specification: Khronos, glTF 2.0, sections 3.6 and 4.4.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

@@ -7,8 +7,6 @@ coefficients by order.
 bytes can take gigabytes: therefore a child process with limits reads it first.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from pathlib import Path

@@ -16,8 +16,6 @@ files are indices into "filenames". The coordinate frame is that of the PLY file
 developer.playcanvas.com, "The Streamed SOG Format". `lod_writer` writes these folders.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

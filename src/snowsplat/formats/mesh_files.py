@@ -4,8 +4,6 @@ PLY and LAS keep the frame of the scene. In GLB, OBJ and USDZ, y is up, as other
 of these formats.
 """
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any

@@ -6,8 +6,6 @@ pixels, a bilinear interpolation of the texture is the linear one of the corners
 what all files share. The package usd-core writes the file: `pip install "snowsplat[usd]"`.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The place is the `scene.origin`, and the true scale of `scene.length`.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Arrays are NumPy, float32 unless stated otherwise, one row per Gaussian, with th
 fields of `GaussianArrays`.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from dataclasses import replace

@@ -4,8 +4,6 @@ The format of a file to read is recognised by its first bytes, not by its name. 
 a signature are recognised by the suffix. The format of a file to write is selected by the suffix.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -12,8 +12,6 @@ translation is the `scene.origin`. A stage states a unit even where it is unknow
 for antialiased scenes. Specification: openusd.org, schema domain usdVol.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """`project_activated`: projects Gaussians that are given after the activations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`adam_step`: the backward pass of `project`, fused with Adam."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

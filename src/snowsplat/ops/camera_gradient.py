@@ -1,7 +1,5 @@
 """`camera_gradient`: from the gradient of splats to the camera that projected them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

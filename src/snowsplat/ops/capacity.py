@@ -1,7 +1,5 @@
 """`Capacity`: memory allocated on a GPU before the amount that a frame requires is known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torch import Tensor

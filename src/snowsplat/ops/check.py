@@ -1,7 +1,5 @@
 """Argument checks of the public ops. Error messages are one line."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

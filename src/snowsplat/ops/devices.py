@@ -1,7 +1,5 @@
 """Selects the device for the computation."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """`fuse_depth`: adds a depth map to a truncated signed distance field, or a photo to points."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

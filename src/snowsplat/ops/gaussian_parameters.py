@@ -1,7 +1,5 @@
 """What the operations read: the six tensors of Gaussians, and the `View` of an image."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ At the first launch on the CPU, `util/native_library.py` loads the library for t
 set. A GPU has the same entries: see `ops/cuda`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

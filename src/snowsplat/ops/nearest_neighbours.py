@@ -1,7 +1,5 @@
 """`neighbours`: distances to the nearest other points."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

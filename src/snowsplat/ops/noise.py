@@ -1,7 +1,5 @@
 """`add_noise`: the noise of MCMC density control."""
 
-from __future__ import annotations
-
 import torch
 
 from snowsplat.ops.check import check_float, check_tensor, variant

@@ -1,7 +1,5 @@
 """`photometric_loss` and `ssim`: the difference between an image and a photo."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """`project`: 3D Gaussians → the 2D splats that a camera sees."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

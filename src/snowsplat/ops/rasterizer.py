@@ -1,7 +1,5 @@
 """`rasterize`: composites 2D splats into an image, front to back."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from typing import Any

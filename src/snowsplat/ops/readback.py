@@ -1,7 +1,5 @@
 """`Readback`: copies values from a device to the CPU while the device continues to compute."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -30,8 +30,6 @@ Coordinate frames are those of OpenCV: x right, y down, z forward. Pixel (i, j) 
 (i + 0.5, j + 0.5).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

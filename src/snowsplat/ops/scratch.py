@@ -8,8 +8,6 @@ become one. So it takes little more than the tensors that exist at the same time
 small, a larger one replaces it. Segments request huge pages.
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 import operator

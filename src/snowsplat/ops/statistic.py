@@ -1,7 +1,5 @@
 """`accumulate_screen_statistics`: the statistics of splats that density control uses."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """`plane_sweep`: inverse depths of a view from other views with known poses."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,8 +4,6 @@
 - [Gallup et al. 2007] Real-Time Plane-Sweeping Stereo with Multiple Sweeping Directions. CVPR.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad

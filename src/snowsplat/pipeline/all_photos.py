@@ -5,8 +5,6 @@ somewhat above. The metrics remain those of the scene before: afterwards, no pho
 docs/what-was-tried.md.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """`clean`: a scene without floaters."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

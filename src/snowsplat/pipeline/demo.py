@@ -1,7 +1,5 @@
 """`demo`: photos of a synthetic scene become a scene again, and its poses are checked."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass

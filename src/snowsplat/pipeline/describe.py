@@ -1,7 +1,5 @@
 """`describe`: what a file or folder contains."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath

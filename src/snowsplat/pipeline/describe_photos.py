@@ -1,7 +1,5 @@
 """`describe_photos`: what `sfm` and `make` would use of photos and videos, and what not."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath

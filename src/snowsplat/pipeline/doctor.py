@@ -4,8 +4,6 @@ This is asked when something is wrong. Therefore it needs only the standard libr
 each package in a process of its own: a broken package may end its process.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """What a person makes in the page of a scene: `edit`: a new scene beside it; `film`: a video."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

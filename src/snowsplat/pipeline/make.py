@@ -3,8 +3,6 @@
 If the input is a dataset, its camera poses are used, unless they are impossible.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 import time

@@ -19,8 +19,6 @@ longer than predicted, a third of the time is still left for the training.
 `given_poses`: the camera poses that a folder of photos has already, if they are plausible.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -13,8 +13,6 @@ costs nothing, and the median lies behind the surface. So the mean difference of
 around a pixel is first subtracted from the depth of the Gaussians, confirmed or not.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

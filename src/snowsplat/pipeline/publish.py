@@ -1,7 +1,5 @@
 """`publish`: a static web site that shows a scene; `viewed_scene`: the page of `view`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 `evaluate` measures PSNR, SSIM and LPIPS of a trained scene.
 """
 
-from __future__ import annotations
-
 import errno
 import logging
 from collections.abc import Callable, Sequence

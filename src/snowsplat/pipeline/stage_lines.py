@@ -1,7 +1,5 @@
 """The lines that are printed about finished stages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The true scale of a scene from a known distance, between two points or two photos of it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import PurePosixPath

@@ -1,7 +1,5 @@
 """`render_video`: a video of a scene along a camera path."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """`watch`: shows the newest scene of an output folder in the browser, also during training."""
 
-from __future__ import annotations
-
 import json
 import sys
 from contextlib import suppress

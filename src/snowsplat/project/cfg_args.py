@@ -1,8 +1,6 @@
 """`cfg_args`: the settings of a training as ``Namespace(name=value, …)``, the format of the
 reference implementation."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 from typing import Any

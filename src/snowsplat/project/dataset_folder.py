@@ -11,8 +11,6 @@
 The layout is that of the reference implementation's convert.py.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`LeftOut`: a photo that is not used, and why."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -7,8 +7,6 @@ The name of the folder depends on its content. So whoever has loaded a page gets
 page, also from a cache, and a site is replaced by one file: `SiteFolder.replace`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -14,8 +14,6 @@ An output folder of the command line is a scene, too. What the studio adds to it
 `studio/`.
 """
 
-from __future__ import annotations
-
 import datetime
 import json
 import shutil

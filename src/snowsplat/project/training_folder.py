@@ -19,8 +19,6 @@
 The reference implementation does not write the entries marked *. Its folders are read too.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

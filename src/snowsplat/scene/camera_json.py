@@ -4,8 +4,6 @@ Position and rotation are the parts of world_from_cam, in OpenCV axes. Sizes and
 in pixels. The format does not store the principal point; readers use the middle of the image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

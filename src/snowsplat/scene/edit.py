@@ -1,7 +1,5 @@
 """Editing a scene: transform, crop, merge. The input Gaussians are not modified."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Sequence

@@ -7,8 +7,6 @@ one, or one of two photos whose poses are wrong, is anywhere within the distance
 longer side. The ratio of the densities is r(d) = √(2/π) (D / σ) exp(−d² / 2σ²).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

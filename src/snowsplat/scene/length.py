@@ -6,8 +6,6 @@ it: a comment of PLY, an entry of SOG, the node of glTF, whose unit is the metre
 other ones.
 """
 
-from __future__ import annotations
-
 import re
 
 from snowsplat.util.errors import Problem

@@ -1,7 +1,5 @@
 """`Mesh`: triangles with coloured vertices."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

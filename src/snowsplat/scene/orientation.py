@@ -1,7 +1,5 @@
 """The up direction of a scene, estimated from its cameras or its surfaces, and its usual scale."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

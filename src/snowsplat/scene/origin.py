@@ -9,8 +9,6 @@ round number near their median. The scene keeps that number as its origin, three
 The origin is (0, 0, 0) unless the distance makes the move necessary.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

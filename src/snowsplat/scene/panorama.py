@@ -5,8 +5,6 @@ the plane of a side, so two sides differ slightly where they meet. There, the im
 gradually from one to the other.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

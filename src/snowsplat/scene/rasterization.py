@@ -1,7 +1,5 @@
 """`rasterization`: the call of gsplat, on a CPU as well as on a GPU."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import wraps

@@ -1,7 +1,5 @@
 """`render`: Gaussians and a camera -> an image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ image c and any weights g of the pixels p, with respect to the colour of the Gau
 The frusta and the surroundings of cameras are for `points_in_frusta` and `points_in_spheres`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

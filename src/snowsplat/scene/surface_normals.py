@@ -1,7 +1,5 @@
 """`normals_of_depth`: the normals of the surface that a depth map shows."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad

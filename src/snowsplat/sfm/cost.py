@@ -23,8 +23,6 @@ number of matches differs between scenes, so the time of a step may differ by 40
 prediction; the error of the sum is smaller.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 import time

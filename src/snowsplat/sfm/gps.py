@@ -1,7 +1,5 @@
 """GPS positions in metres, and how far they can be trusted."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

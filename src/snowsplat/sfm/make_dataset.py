@@ -3,8 +3,6 @@
 An interrupted run resumes where it stopped; see `snowsplat.util.stages`.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """`DatasetOptions`: what one can set of structure from motion. This module imports nothing slow."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -4,8 +4,6 @@ A job holds its lock before the worker is imported, which takes seconds: a studi
 these seconds knows that the job runs.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The tables `ROUTES` say what is answered where. Answers are JSON; an error is
 ``{"error": {"en": …, "zh": …}}``, one line for people. A scene has the address /scenes/NAME.
 """
 
-from __future__ import annotations
-
 from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any

@@ -4,8 +4,6 @@ Each of these is called by one process at a time, which holds `StudioScene.edit_
 process is killed, the next call finishes what is left, or does all of it.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Mapping

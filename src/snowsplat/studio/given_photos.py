@@ -1,7 +1,5 @@
 """The photos that were given for a scene, before its job, and those that are left out."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass

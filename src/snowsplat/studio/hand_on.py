@@ -1,7 +1,5 @@
 """The formats in which a finished scene is handed on, and the command lines that do the same."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 

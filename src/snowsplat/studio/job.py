@@ -1,7 +1,5 @@
 """The processes of a scene: `start` and `stop` a job, ask whether one runs, and run other work."""
 
-from __future__ import annotations
-
 import json
 import socket
 import subprocess

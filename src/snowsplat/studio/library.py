@@ -1,7 +1,5 @@
 """`Library`: the folder of the studio, which has a folder for each scene; see `StudioScene`."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Requests about the library: the page, its addresses, folders of this machine, all scenes."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import socket

@@ -5,8 +5,6 @@ Two servers would not know of each other's uploads, edits and removals. The lock
 the file.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import urllib.request

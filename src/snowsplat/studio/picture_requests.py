@@ -1,7 +1,5 @@
 """Requests for pictures: the photos of a scene, a small picture of it, the map of its cameras."""
 
-from __future__ import annotations
-
 import asyncio
 import io
 import math

@@ -1,7 +1,5 @@
 """`Recorder`: writes the progress of a task to the state of its scene."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress

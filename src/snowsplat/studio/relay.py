@@ -4,8 +4,6 @@ The job listens at a port of its own, on the loopback interface. Browsers of the
 elsewhere, so that they reach the studio only. The files of the page are those of the studio.
 """
 
-from __future__ import annotations
-
 import asyncio
 from contextlib import suppress
 

@@ -1,7 +1,5 @@
 """What the answers to requests have in common: the studio, files, JSON, errors."""
 
-from __future__ import annotations
-
 import asyncio
 from collections import defaultdict
 from collections.abc import Awaitable, Callable

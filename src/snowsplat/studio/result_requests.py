@@ -1,7 +1,5 @@
 """Requests about a finished scene: files, films, edits, and its pages."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import asdict
 from html import escape

@@ -1,7 +1,5 @@
 """Requests about a scene: its state, uploads and job."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Texts for the page, which shows them in the language that was chosen in the browser."""
 
-from __future__ import annotations
-
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.util.messages import as_message, message
 from snowsplat.util.safe_json import printable

@@ -1,7 +1,5 @@
 """Uploads in parts, which resume: a file appears under its name when all of it has arrived."""
 
-from __future__ import annotations
-
 import filecmp
 import itertools
 import os

@@ -8,8 +8,6 @@ line of JSON; of those that change files, one at a time works on a scene, also i
 killed and started again meanwhile.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import traceback

@@ -1,7 +1,5 @@
 """Colours of the vertices of a mesh from photos."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

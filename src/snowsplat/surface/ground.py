@@ -1,7 +1,5 @@
 """The ground of a scene: a coarse mesh to walk on, from depth maps of the views of its photos."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

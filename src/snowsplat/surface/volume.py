@@ -11,8 +11,6 @@ sign changes becomes a quad of the vertices of its four cells. The triangles are
 those of marching cubes, and half as many; no library has them for sparse blocks.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

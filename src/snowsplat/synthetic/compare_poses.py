@@ -1,7 +1,5 @@
 """Errors of estimated poses; estimated and true poses are aligned by a similarity transform."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ Directions have length 1. A surface has one or more faces, each with coordinates
 v points downwards as in an image. `points` is the inverse of `surface`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Protocol
 

@@ -3,8 +3,6 @@
 Metres, z up; the centre of the table top is the origin. All textures depend on the seed.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ values (H, W, 3) float32 from 0 to 1. Details are a few pixels wide: finer ones 
 aliasing, and coarser ones would not yield enough features.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -5,8 +5,6 @@ around everything. Rays are intersected in closed form, so poses, images and poi
 Colours vary slowly over the surfaces, so that a few hundred Gaussians can represent them.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Properties of a set of cameras: up direction, focus, viewing distance."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

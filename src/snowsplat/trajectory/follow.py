@@ -3,8 +3,6 @@
 The first ones are visited in the order of their names, or in that of a short tour.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

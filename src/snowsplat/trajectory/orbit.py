@@ -1,7 +1,5 @@
 """Closed paths around one point, such as the focus of the cameras; all frames look at it."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

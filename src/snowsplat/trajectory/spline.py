@@ -1,7 +1,5 @@
 """Smooth curves through samples: the natural cubic smoothing spline."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

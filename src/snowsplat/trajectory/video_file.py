@@ -8,8 +8,6 @@ codec. https://github.com/google/spatial-media/tree/master/docs
 Photos have GPano in XMP. https://developers.google.com/streetview/spherical-metadata
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Line charts as SVG for reports, with round numbers on the axes, in the colours of the page."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The errors that a user can fix, in one line."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from snowsplat.util.messages import Message, as_message, message

@@ -3,8 +3,6 @@
 The command line parses them (`snowsplat.cli.parser`); `command_line` writes them.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterable, Iterator, Mapping

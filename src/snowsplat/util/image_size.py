@@ -1,7 +1,5 @@
 """`scaled_size`: the size of a reduced image. Without libraries: workers start with it."""
 
-from __future__ import annotations
-
 
 def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
     """The size of an image with its longest side at most ``longest`` pixels; never enlarged."""

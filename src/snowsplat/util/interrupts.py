@@ -1,7 +1,5 @@
 """Ctrl-C during training, and the signals that end a program on a server in the same way."""
 
-from __future__ import annotations
-
 import os
 import signal
 import stat

@@ -8,8 +8,6 @@ file of an unknown source in a child process, which has limits of SECONDS of pro
 BYTES of additional memory.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import math

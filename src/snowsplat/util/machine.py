@@ -1,7 +1,5 @@
 """This machine, without user name or host name; and the memory of this process."""
 
-from __future__ import annotations
-
 import gc
 import os
 import platform

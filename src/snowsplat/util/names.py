@@ -1,7 +1,5 @@
 """Lists of names for a line of text."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from snowsplat.util.messages import Message, message

@@ -7,8 +7,6 @@ bytes: a tensor, or another object with a method `data_ptr`, is passed as a data
 null pointer, int and bool as int64, and float as double.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator, Mapping

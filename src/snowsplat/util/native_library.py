@@ -7,8 +7,6 @@ SNOWSPLAT_ISA (avx512, avx2 or baseline) selects another library than the best.
 This module does not import torch, so that programs that only process NumPy arrays start fast.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import os

@@ -1,7 +1,5 @@
 """The order of names in which numbers count by their value."""
 
-from __future__ import annotations
-
 import re
 
 _DIGITS = re.compile(r"([0-9]+)")

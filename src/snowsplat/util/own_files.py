@@ -3,8 +3,6 @@
 The variable SNOWSPLAT_IMPORT passes them on to the processes that a command starts.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """A setting of the process during training: one torch thread."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

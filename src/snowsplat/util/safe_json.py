@@ -1,7 +1,5 @@
 """Reading untrusted JSON and file names: limited memory, no paths outside a folder."""
 
-from __future__ import annotations
-
 import functools
 import json
 import os

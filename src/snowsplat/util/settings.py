@@ -10,8 +10,6 @@ documentation are made from the same fields. This module imports nothing slow: n
 numpy.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, fields, replace

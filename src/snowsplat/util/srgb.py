@@ -1,7 +1,5 @@
 """The curve of sRGB, between the values of a picture and linear light."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

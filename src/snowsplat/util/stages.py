@@ -5,8 +5,6 @@ key of a stage also depends on all earlier stages. So if the input or the settin
 change, this stage and all later ones are repeated.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import time

@@ -6,8 +6,6 @@ can make a browser connect to this machine. The browser writes these headers, so
 `listen` opens a socket at an address of this machine, with an error message for each failure.
 """
 
-from __future__ import annotations
-
 import errno
 import ipaddress
 import logging

@@ -1,7 +1,5 @@
 """`lens_findings`: real lenses pass, impossible ones are named."""
 
-from __future__ import annotations
-
 import pytest
 
 from snowsplat.data.judge.lens_check import field_of_view, lens_findings

@@ -1,7 +1,5 @@
 """`judge`: right cameras pass in every frame and unit; the usual mistakes are found and named."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Depth maps: each format and kind of values, ranges, damaged files."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Normal maps: each format and coding, unknown pixels, files that are none."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

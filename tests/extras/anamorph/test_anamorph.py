@@ -1,7 +1,5 @@
 """An anamorph: each side shows its own picture; a solid is a closed pile that hides nothing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

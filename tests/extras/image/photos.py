@@ -1,7 +1,5 @@
 """A small photo for the tests: smooth shapes with edges, from formulas."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The compact file: what is read is what was written, and damaged files are rejected."""
 
-from __future__ import annotations
-
 import struct
 import xml.etree.ElementTree as ElementTree
 import zlib

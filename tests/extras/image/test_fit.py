@@ -1,7 +1,5 @@
 """`Fitter`: both blendings approximate a photo; the result is reproducible."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """A small ray-traced scene with true depth: two photos of a ball and a box in a room."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

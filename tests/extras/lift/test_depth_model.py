@@ -1,7 +1,5 @@
 """Networks on disk: an ONNX file and a folder of transformers, both made here."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`lift`: the photo from its own pose, a second viewpoint, unknown depths, fewer Gaussians."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Links, tangents, discs: compared with planes, whose tangents are known in closed form."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

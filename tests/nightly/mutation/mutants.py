@@ -5,8 +5,6 @@ is not used, because it omits decorated functions, default values of dataclasses
 modules. These contain the numbers of the paper.
 """
 
-from __future__ import annotations
-
 import ast
 import warnings
 from collections.abc import Iterator

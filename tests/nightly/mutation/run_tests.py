@@ -12,8 +12,6 @@ RUN is a file with a JSON object, which has these keys:
     coverage                a file for the executed lines; null: stop at the first failure instead
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource

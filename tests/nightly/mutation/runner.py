@@ -1,7 +1,5 @@
 """Runs tests on mutants: selects the tests that can detect a fault, and runs them."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The tables beside this file: faults of the kernels, and faults without an effect."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ UndefinedBehaviorSanitizer (Python then needs LD_PRELOAD, see `make sanitized`),
 SNOWSPLAT_ORDER sets the order in which the threads of a block run: see cuda_emulation.h.
 """
 
-from __future__ import annotations
-
 import ctypes
 import fcntl
 import functools

@@ -1,7 +1,5 @@
 """Starts the child processes of COLMAP as forks of a process that has loaded their modules."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -5,8 +5,6 @@ In the folded model, the far part is shifted, so that its group of points coinci
 of the near part. No photos are needed: the database contains features and verified matches.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

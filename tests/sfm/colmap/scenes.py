@@ -1,7 +1,5 @@
 """Renders small photos of textured boards from known cameras. SfM takes only seconds with them."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Features and verified matches of a walk along a street or around a place; there are no photos."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

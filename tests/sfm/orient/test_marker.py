@@ -1,7 +1,5 @@
 """The scale from printed markers: rendered into photos with known poses."""
 
-from __future__ import annotations
-
 import functools
 import math
 from pathlib import Path

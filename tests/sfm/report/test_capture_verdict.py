@@ -1,7 +1,5 @@
 """The verdict on photos: each rule with and without its reason."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

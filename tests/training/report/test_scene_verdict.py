@@ -1,7 +1,5 @@
 """The verdict on a scene, from the metrics of held-out and training photos."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

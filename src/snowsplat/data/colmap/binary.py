@@ -4,8 +4,6 @@ Counts in the files are not trusted: before anything is allocated, the declared 
 must fit into the file.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

@@ -3,8 +3,6 @@
 The format: https://colmap.github.io/format.html
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Finds COLMAP models in the folder of a dataset, and the folder of their images."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """COLMAP's text files: cameras.txt, images.txt, points3D.txt."""
 
-from __future__ import annotations
-
 import logging
 import math
 import re

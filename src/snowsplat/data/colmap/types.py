@@ -1,7 +1,5 @@
 """The records of a COLMAP model, and the checks that binary and text files share."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Lists the files of a folder, and tells from the names of folders what is in them."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

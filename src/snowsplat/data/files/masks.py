@@ -11,8 +11,6 @@ For the photo ``images/sub/IMG.jpg``, these are masks:
 The format may be any of `decode.IMAGE_SUFFIXES`; letters may be in upper or lower case.
 """
 
-from __future__ import annotations
-
 import functools
 import logging
 import os

@@ -5,8 +5,6 @@ those of another computer, folders are added or removed, and names change their 
 taken only if there is no doubt.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

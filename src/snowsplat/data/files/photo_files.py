@@ -1,7 +1,5 @@
 """The photos in the folder of a dataset, and the line about names that differ from their files."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path

@@ -1,8 +1,6 @@
 """An axis-aligned box around a scene, from its points or, without points, from its cameras; and
 the near plane of the cameras."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

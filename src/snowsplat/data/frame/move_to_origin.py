@@ -1,7 +1,5 @@
 """Moves a dataset that is far from 0, before its numbers become float32; see `scene.origin`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

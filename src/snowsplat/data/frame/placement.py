@@ -1,7 +1,5 @@
 """What is known about level, north and scale of a dataset: an entry of sfm.json, and its words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

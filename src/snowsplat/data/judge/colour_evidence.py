@@ -1,7 +1,5 @@
 """`ColourEvidence`: do the points have the colours of the photos where the cameras see them?"""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 """`Finding`, what a check of cameras has found, and `lens_findings`: whether the intrinsics of a
 pinhole camera are those of a real one."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """`mask_findings`: whether the masks of a dataset ignore everything, or the wrong side."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -5,8 +5,6 @@ numbers of a quaternion, units, and the frame of the points. The judge tests eac
 data: if one of them fits and the given cameras do not, the mistake has a name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations, product

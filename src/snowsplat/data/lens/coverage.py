@@ -1,7 +1,5 @@
 """What a photo shows: the image circle of its lens, and the pixels of a view that are in it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

@@ -4,8 +4,6 @@
 angle the pixels return to the centre. `views` finds this angle.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ It is chosen so that the undistorted image has no blank borders and no folded pa
 calibration that SfM may return.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ Photos are sampled with Catmull-Rom splines, which have at most a third of the e
 interpolation. Training uses every pixel, so blur added here would limit its quality.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from PIL import Image
 

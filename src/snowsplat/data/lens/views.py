@@ -8,8 +8,6 @@ than 120°, and a panorama, become several views, which overlap and look in diff
         pixels = undistort_image(photo, view)   # see `resample`
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence

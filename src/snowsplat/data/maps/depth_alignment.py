@@ -1,7 +1,5 @@
 """Fits the scale of a depth map, and the shift of its disparity, to 3D points of the same scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Reads maps that belong to photos from files: depths, as camera z, and normals."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path

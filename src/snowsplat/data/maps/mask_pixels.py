@@ -3,8 +3,6 @@
 Programs do not agree whether black or white marks what to ignore. Here it is black.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ measures. The values of thermal cameras are far from 0, and close to each other.
 from all photos of the folder, because photos that are scaled one by one would not match.
 """
 
-from __future__ import annotations
-
 import logging
 import sys
 import threading

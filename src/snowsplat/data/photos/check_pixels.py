@@ -6,8 +6,6 @@ valid codes. PNG and TIFF by deflate have checksums. In WebP, AVIF and HEIC near
 valid, and in formats without compression all of them.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@ A photo without a profile has the colours of sRGB. Phones write Display P3; came
 often without a profile: then only the EXIF data say it.
 """
 
-from __future__ import annotations
-
 import io
 import logging
 import struct

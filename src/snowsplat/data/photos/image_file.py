@@ -1,7 +1,5 @@
 """Opening image files from untrusted sources; files that would take too long are rejected."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

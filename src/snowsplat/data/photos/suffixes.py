@@ -1,7 +1,5 @@
 """The suffixes of photos and videos that are read: one list, which needs no torch."""
 
-from __future__ import annotations
-
 from snowsplat.data.photos.image_file import OPTIONAL_FORMATS
 
 

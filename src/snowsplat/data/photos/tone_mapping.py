@@ -1,7 +1,5 @@
 """Tone mapping: from the signals of HDR, PQ and HLG, to sRGB; of films, HEIC and AVIF photos."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

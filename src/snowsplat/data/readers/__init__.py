@@ -4,8 +4,6 @@ A reader is a module with a `Reader`, and a line in `READERS`. Nothing here undi
 `PosedImage.lens` tells the lens of a photo.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path

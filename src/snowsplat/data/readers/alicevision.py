@@ -4,8 +4,6 @@ The rotation is stored by columns, cam_from_world, in OpenCV axes. The centre of
 at (0, 0). The principal point is relative to the centre of the photo.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

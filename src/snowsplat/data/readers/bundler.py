@@ -4,8 +4,6 @@ A camera has the axes of OpenGL: y is up, and it looks along −z. The origin of
 centre. https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html describes the format.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -4,8 +4,6 @@ COLMAP's conventions are those of `Camera`: OpenCV axes, cam_from_world, pixel c
 No conversion is needed.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

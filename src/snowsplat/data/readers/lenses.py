@@ -4,8 +4,6 @@ Pixels are those of `Camera`: the centre of the first pixel is at (0.5, 0.5). Co
 tangential distortion are in the order of OpenCV: x += 2 p₁ x y + p₂ (r² + 2 x²).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from snowsplat.data.lens.lens import Lens

@@ -4,8 +4,6 @@ A row has a matrix 3 × 5: world_from_cam with the axes down, right and backward
 height, width and focal length of the photos in full size; two depths follow.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

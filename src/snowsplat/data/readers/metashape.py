@@ -5,8 +5,6 @@ of the chunk to the world. Pixels are those of `Camera`, but the principal point
 centre of the photo. The lens model is in an appendix of the manual of Metashape.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from pathlib import Path

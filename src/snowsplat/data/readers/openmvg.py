@@ -3,8 +3,6 @@
 The centre of the first pixel is at (0, 0). Without "structure", the file has no points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

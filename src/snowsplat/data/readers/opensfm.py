@@ -4,8 +4,6 @@ Poses are cam_from_world in OpenCV axes, with the rotation as a vector. Lengths 
 units of its larger side, from its centre. https://opensfm.org/docs/geometry.html describes them.
 """
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Reading the files of other programs: bounded memory, numbers that are finite, true rotations."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path

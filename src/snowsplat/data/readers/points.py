@@ -1,7 +1,5 @@
 """`points_beside`: the point cloud that was exported beside the cameras, in a file of its own."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from pathlib import Path

@@ -6,8 +6,6 @@ up and looks along −z; units are metres. Depth maps have millimetres;
 maps of their confidence are 0 where it is low.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`Layout`: a table, or a folder of tables, of matrices that are the poses of photos."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -25,8 +25,6 @@ Where nothing tells the camera, ``intrinsics.txt`` may: fx fy cx cy in pixels, w
 OpenCV may follow, or K.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import zipfile

@@ -1,7 +1,5 @@
 """`advice`: what to do with the files of programs that are not readable here."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from snowsplat.data.colmap.places import folders_below

@@ -10,8 +10,6 @@ An XMP file has cam_from_world as a rotation, by rows, in OpenCV axes, and the p
 camera (the help page "RealityCapture XMP Camera Math"). Its lengths are as those of the table.
 """
 
-from __future__ import annotations
-
 import csv
 import logging
 import math

@@ -1,8 +1,6 @@
 """What all readers have in common: `Reader`, the `PhotoFolder` that one gets, and the
 `Reconstruction` that it returns."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager

@@ -5,8 +5,6 @@ A pose is a quaternion x, y, z, w and the position of the camera, with y up, loo
 are metres.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from pathlib import Path

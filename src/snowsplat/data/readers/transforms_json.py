@@ -15,8 +15,6 @@ All variants store world_from_cam in OpenGL axes (x right, y up, z backward). It
 cam_from_world in OpenCV axes. The world frame is neither centred nor scaled.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections import ChainMap

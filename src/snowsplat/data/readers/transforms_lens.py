@@ -5,8 +5,6 @@ instant-ngp and nerfstudio write the coefficients of OpenCV's models, ``k1`` …
 other lenses is that of the eighth power of the radius, where OpenCV has a rational function.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -10,8 +10,6 @@ discs are a grid of n × n cells; `Shape` says how deep in the cube each of them
   each line of sight along an axis meets it once, on a face that only this side sees.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

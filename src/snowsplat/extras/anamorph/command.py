@@ -1,7 +1,5 @@
 """`snowsplat anamorph`: Gaussians that show another picture from each side."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`make_anamorph`: Gaussians that show another picture from each side."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`AnamorphOptions`: what one can set of an anamorph. It imports nothing slow."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

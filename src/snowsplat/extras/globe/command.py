@@ -1,7 +1,5 @@
 """`snowsplat globe`: a scene in a snow globe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

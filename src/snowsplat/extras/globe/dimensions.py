@@ -4,8 +4,6 @@ The origin is the centre of the glass sphere, whose radius is 1. As everywhere i
 up. A flat floor closes the sphere at the bottom. Below it is a turned base.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 #: y of the floor, on which the scene stands and on which the snow lies.

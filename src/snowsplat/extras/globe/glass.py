@@ -4,8 +4,6 @@
 page does the same on the GPU (`web/behind.frag`, `web/front.frag`), with the same colours.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ script and shaders are in the folder `web`; the constants in them come from the 
 package. The Gaussians are quantised to 26 bytes each, and embedded in base64.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import html

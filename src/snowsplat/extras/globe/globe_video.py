@@ -7,8 +7,6 @@ A Gaussian that is snow is small, opaque, brighter, and turned. The page does th
 (`web/splats.vert`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

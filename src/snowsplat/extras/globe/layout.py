@@ -3,8 +3,6 @@
 The frame is that of `snowsplat.extras.globe.dimensions`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """`make_globe`: a scene in a snow globe, as a web page and a video."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

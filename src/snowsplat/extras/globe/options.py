@@ -1,7 +1,5 @@
 """`GlobeOptions`: what one can set of a snow globe. This module imports nothing slow."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from snowsplat.pipeline.options.video import VideoSize

@@ -24,8 +24,6 @@ from here, and a test compares both. Lengths are in radii of the glass, times in
 seconds. The frame is that of `snowsplat.extras.globe.dimensions`: y is down.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

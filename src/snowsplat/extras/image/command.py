@@ -1,7 +1,5 @@
 """`snowsplat image`: a photo as 2D Gaussians."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

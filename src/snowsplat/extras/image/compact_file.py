@@ -15,8 +15,6 @@ along a Z-order curve, and the levels of x and y are stored as differences modul
 `write_svg` writes them as a picture in the format SVG: one ellipse with a radial gradient for each.
 """
 
-from __future__ import annotations
-
 import lzma
 import math
 import struct

@@ -1,7 +1,5 @@
 """`FitOptions`: what one can set of the fit of an image. This module imports nothing slow."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Fewer Gaussians than pixels: uniform parts of the photo share one Gaussian."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """`snowsplat lift`: one photo and its depth map become a scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

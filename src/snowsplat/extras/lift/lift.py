@@ -1,7 +1,5 @@
 """`lift`: a photo and its depth map -> flat Gaussians with the colours of the photo."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -9,8 +9,6 @@ Two kinds of models are supported, both given by their path:
 - a folder of the library transformers with a model for depth estimation.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass, field

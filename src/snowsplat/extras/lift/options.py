@@ -1,7 +1,5 @@
 """`LiftOptions`, `DepthSource`: what one can set of a lifted photo. It imports nothing slow."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

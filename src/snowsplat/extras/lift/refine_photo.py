@@ -1,7 +1,5 @@
 """`refine_photo`: a lifted photo of a dataset, trained further on all photos of the dataset."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks whether a GPU can be used, and if not, explains why; `inventory` is for doctor."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import importlib

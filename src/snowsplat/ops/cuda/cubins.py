@@ -3,8 +3,6 @@
 A cubin runs on GPUs of its compute capability, and of later capabilities of the same major version.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """The kernels for GPUs: the file of each, and how it is launched."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """The native functions on a GPU: one kernel each, or a sequence of kernels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

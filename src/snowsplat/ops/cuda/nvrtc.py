@@ -7,8 +7,6 @@ script, in an environment that has neither (see CMakeLists.txt).
     python nvrtc.py SOURCE --target sm_90 --output FILE
 """
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import os

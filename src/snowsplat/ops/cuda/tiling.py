@@ -10,8 +10,6 @@ only on the GPU, `sort_pairs` takes an upper bound and a tensor with the actual 
 functions do not wait for the GPU.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

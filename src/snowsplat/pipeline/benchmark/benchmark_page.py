@@ -1,7 +1,5 @@
 """The tables of a benchmark: text, JSON, CSV, LaTeX, and a page."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable, Sequence

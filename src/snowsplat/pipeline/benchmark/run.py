@@ -1,7 +1,5 @@
 """`benchmark`: trains and evaluates all scenes of a folder."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -3,8 +3,6 @@
 Joining them needs the memory of one block.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

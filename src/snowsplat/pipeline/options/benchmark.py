@@ -1,7 +1,5 @@
 """`BenchmarkOptions`, `PlanOptions`: what one can set of `benchmark` and of `plan_blocks`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Options that several functions have, as fields of their options."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`MakeOptions`: what one can set of `make`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """`Edits`, `MeshOptions`, `PublishOptions`: options of what is made of a finished scene."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from importlib.util import find_spec

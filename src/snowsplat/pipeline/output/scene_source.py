@@ -1,7 +1,5 @@
 """Loads a scene and its cameras from the output folder of a training run, or from a file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

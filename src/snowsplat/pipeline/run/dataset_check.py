@@ -4,8 +4,6 @@ Stamps of photos and masks, which `resume` compares, tell what has changed, and 
 which `make` compares.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os

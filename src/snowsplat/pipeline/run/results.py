@@ -1,7 +1,5 @@
 """What `train` and `make` return: `TrainResult`, `TrainingStopped` after Ctrl-C, `MakeResult`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`TrainingRun`: runs the steps of one training run and writes its files."""
 
-from __future__ import annotations
-
 import logging
 import time
 import warnings

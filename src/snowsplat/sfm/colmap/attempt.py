@@ -1,7 +1,5 @@
 """One attempt to estimate poses: matches, a mapper, and the checks of what it has made."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ database stores a fingerprint of the photos and settings. Its features and match
 if the fingerprint is unchanged.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sqlite3

@@ -1,7 +1,5 @@
 """Computes the `SfmResult` from COLMAP models: which photos have a pose, and how good they are."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

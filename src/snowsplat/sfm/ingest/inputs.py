@@ -4,8 +4,6 @@ Files in ``input/`` are upright, in a format that COLMAP reads, and have been de
 check. Images without content are skipped and reported; at least three images must remain.
 """
 
-from __future__ import annotations
-
 import errno
 import logging
 from collections import Counter

@@ -1,7 +1,5 @@
 """A photo of a dataset, and its name in ``input/``: unique, and not too long."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 

@@ -5,8 +5,6 @@ tell how the scene is rolled about the path. So the similarity is found by weigh
 together with the up direction that is known otherwise, and it is used only as far as it is certain.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -12,8 +12,6 @@ Each is a direction with a covariance, and they are combined by these. GPS posit
 with the result in `positions`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

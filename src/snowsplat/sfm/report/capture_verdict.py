@@ -4,8 +4,6 @@ Each rule has a reason that does not depend on the scene. Lengths are relative t
 of the scene.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ Everything is measured on the points of a COLMAP model and the photos that obser
 of a panorama or of a wide lens are one photo.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """dataset_report.html: the result of structure from motion as one self-contained page."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 The frame is that of `orient`: y points down.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

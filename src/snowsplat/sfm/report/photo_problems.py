@@ -4,8 +4,6 @@ The photos in question had enough features for a pose; `ingest.sharpness` reject
 But a blurred photo still blurs the scene, and a photo without shadows or lights loses its colours.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, NamedTuple

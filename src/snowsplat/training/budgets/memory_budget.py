@@ -4,8 +4,6 @@ The memory that a process needs after importing PyTorch is not included; on a GP
 memory that the driver allocates for itself.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

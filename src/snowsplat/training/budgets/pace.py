@@ -8,8 +8,6 @@ budget, `Schedule.stretch` then distributes the rest of the schedule over as man
 time for. No part of the schedule is skipped.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -4,8 +4,6 @@ If there is more time, first the number of steps is increased, then the size of 
 number of Gaussians: see docs/performance.md.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 import time

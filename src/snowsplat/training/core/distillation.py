@@ -4,8 +4,6 @@ The renderings replace the photos, so only the cameras of the photos are needed.
 distillation of a neural network, the larger scene is the teacher and the smaller one the student.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

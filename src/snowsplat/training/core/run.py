@@ -1,7 +1,5 @@
 """`Run`: what the loop and the parts of a training share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial

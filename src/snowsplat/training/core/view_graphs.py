@@ -11,8 +11,6 @@ There are two graphs, because the CPU reads the loss back between the forward an
 see `StepRunner`. Density control and the optimiser are not recorded: they depend on the step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol

@@ -7,8 +7,6 @@ only these two dataclasses. `AdaptiveDensity` is the density control of the pape
 is that of Kheradmand et al. 2024.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Protocol
 

@@ -4,8 +4,6 @@ A photo that is overexposed only says that the image is at least as bright. Few 
 step visits only them. Everything else is one pass over the image, and one over its gradient.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -21,8 +21,6 @@ gains. Again, this variance is the covariance of two halves. Or the gains differ
 from about the same place, where surfaces shine alike.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

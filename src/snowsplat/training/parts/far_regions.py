@@ -13,8 +13,6 @@ illuminated so evenly.
 The sphere of directions in cells of similar size: a cube map. Statistics of values by cell.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

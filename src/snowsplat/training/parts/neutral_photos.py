@@ -1,7 +1,5 @@
 """`NeutralPhotos`: the photos of a dataset as if all had the same exposure and white balance."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import torch

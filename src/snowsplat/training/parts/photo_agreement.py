@@ -4,8 +4,6 @@ This tells a wrong pose from a part of the scene that is hard to reproduce. Fog 
 may reproduce a photo with a wrong pose; other photos do not show the same at the depth of the fog.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -15,8 +15,6 @@ The images do not change if all cameras and the scene are moved and scaled toget
 cannot determine this similarity transform, the *gauge*; see `Gauge`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -10,8 +10,6 @@ show differently, because of a sensor, a focus or a pose, or since the training 
 usual in these photos.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

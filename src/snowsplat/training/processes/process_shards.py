@@ -1,7 +1,5 @@
 """`ProcessShards`: `Shards` of several processes, with `torch.distributed`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

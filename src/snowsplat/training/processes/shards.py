@@ -12,8 +12,6 @@ So a view is blended from the same rows in the same order, and the result is the
 `process_shards.ProcessShards` is the case of several processes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The best and the worst views: photo, rendering, and error."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """report.html: the course and the result of a training run, as one self-contained page."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex

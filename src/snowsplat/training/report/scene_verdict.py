@@ -6,8 +6,6 @@ with training photos tells why: if those look right, the scene lacks photos, not
 verdict on the photos only predicts has less weight.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

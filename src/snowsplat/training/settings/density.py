@@ -11,8 +11,6 @@ registered:
     class MyDensity(DensitySettings): ...
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar, Protocol, TypeVar
 

@@ -1,7 +1,5 @@
 """`changed`: settings by name, those of `TrainConfig` and of its parts alike."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import Any
 

@@ -5,8 +5,6 @@
 A recipe is a function that returns a `TrainConfig`. `register_recipe` adds one to `RECIPES`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

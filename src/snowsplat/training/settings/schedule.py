@@ -1,7 +1,5 @@
 """`Schedule`: the number of steps of a training run, and the steps of fractions of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A `TrainConfig` as JSON values, for checkpoints and `config.json`."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import asdict, fields
 from typing import Any

@@ -1,7 +1,5 @@
 """`depth_points`: points on the surfaces, from the depth maps of the dataset."""
 
-from __future__ import annotations
-
 import logging
 import math
 

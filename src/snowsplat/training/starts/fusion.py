@@ -2,8 +2,6 @@
 to one another are merged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """`initial_gaussians`: the first Gaussians, from the points of one or more starts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Photos at a reduced size, for the starts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from typing import TypeVar

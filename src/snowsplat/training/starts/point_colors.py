@@ -1,7 +1,5 @@
 """The colours of points of the dataset in its photos."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample

@@ -1,7 +1,5 @@
 """`random_points`: a start that needs neither points nor depths, only cameras and photos."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

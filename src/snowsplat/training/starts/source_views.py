@@ -1,7 +1,5 @@
 """The views of a dataset that get a depth map, and the source views that check it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

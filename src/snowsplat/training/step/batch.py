@@ -1,7 +1,5 @@
 """The gradients of a batch of views: the part of a step in which processes exchange splats."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar

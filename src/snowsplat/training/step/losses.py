@@ -1,7 +1,5 @@
 """The training loss of one view: eq. 7 of the paper, with masks and transparent photos."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@
 updates the parameters in the same pass. `Adam` stores the state between steps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, InitVar, dataclass, field

@@ -20,8 +20,6 @@ On the CPU, the same code runs, but every operation is complete when it returns,
 always suffices. Only the initial capacity is different.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """`ViewGradient`: the gradient of the loss of one view with respect to its splats."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -11,8 +11,6 @@ Therefore:
   WebSockets, and closes those that no longer answer.
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import hmac

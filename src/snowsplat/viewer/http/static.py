@@ -1,7 +1,5 @@
 """Files for browsers, in memory or on disk, and an ASGI app that serves a table of them."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """The files of the page of a training; the studio serves them itself, so this needs no torch."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from snowsplat.util.html import THEME

@@ -1,7 +1,5 @@
 """The photos of a dataset: their cameras for the page, their pixels for comparisons."""
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 import threading

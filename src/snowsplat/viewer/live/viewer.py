@@ -1,7 +1,5 @@
 """`NetworkViewer`: a page for any number of browsers, and the images that they request."""
 
-from __future__ import annotations
-
 import asyncio
 import html
 import itertools

@@ -5,8 +5,6 @@ any browser with WebGL 2, and makes no network requests. The scene is embedded a
 base64, the same as that of a published site. Pages are written, but cannot be read.
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import io

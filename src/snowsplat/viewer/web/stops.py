@@ -7,8 +7,6 @@ The pictures are renders, because the photos may be elsewhere. All of them are i
 left to right.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ the title and the initial view are inserted at the places that it provides, and 
 at the place where the page creates the viewer. The studio serves it, so this needs no torch.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import html

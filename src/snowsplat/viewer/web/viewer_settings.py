@@ -1,7 +1,5 @@
 """The settings of the viewer of finished scenes: views, colours, its film, annotations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

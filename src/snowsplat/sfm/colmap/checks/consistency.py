@@ -15,8 +15,6 @@ of a pair is the share of its matches that the model confirms. The *supported de
 its demand multiplied by the support of its pair.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Explains to the user why photos have no pose, from the features and matches."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The verified matches of two photos, and how far they are from where the poses of a model say."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

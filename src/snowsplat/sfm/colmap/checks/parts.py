@@ -5,8 +5,6 @@ supported. Parts grow along the pairs that the model confirms, as in Kruskal's a
 maximum spanning tree of the view graph, but those that contradict each other are not joined.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Makes a model again, without false matches, if photos of it are in a wrong place."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

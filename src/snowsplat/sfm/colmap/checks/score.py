@@ -26,8 +26,6 @@ Complexity. k is the number of parameters of the poses and lenses, n that of the
 photos (Schwarz 1978).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -19,8 +19,6 @@ has the motions of the frame as columns, and G_K⁺ is the pseudo-inverse of its
 all positions are determined.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray

@@ -4,8 +4,6 @@ Towards the poles, a 360° panorama is stretched more and more, so its features 
 pinhole views of it. Their positions and shapes are those in the panorama.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 The parameters of the detection are the defaults of COLMAP.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -13,8 +13,6 @@ scene does not determine the focal length of each photo. Whether the groups are 
 the `score` of the model that is estimated with them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 

@@ -8,8 +8,6 @@ of them agree with it, then the lens is a fisheye. Of a few focal lengths, the o
 most matches agree is near enough for bundle adjustment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

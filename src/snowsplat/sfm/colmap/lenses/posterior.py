@@ -18,8 +18,6 @@ matrices Λ of the observations and Π of the prior about p₀, the maximum of t
 The other parameters then are adjusted with p held.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable, Mapping, Sequence
 

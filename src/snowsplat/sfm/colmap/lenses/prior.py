@@ -11,8 +11,6 @@ the focal length, as shares of this distance: k₁ ρ², k₂ ρ⁴, and p ρ fo
 which come from a lens that is not exactly centred.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

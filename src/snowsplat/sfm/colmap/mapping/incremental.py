@@ -10,8 +10,6 @@ The estimation of poses and points and the bundle adjustment are those of COLMAP
 mapper (Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016).
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager

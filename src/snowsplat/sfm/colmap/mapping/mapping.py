@@ -1,7 +1,5 @@
 """Estimates camera poses and points from matches, and removes unreliable poses and points."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext

@@ -8,8 +8,6 @@ tracks with union-find in "Adaptive structure from motion", ACCV 2012; Cui, Shen
 number in "Efficient and robust large-scale structure from motion via track selection", 2016.)
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

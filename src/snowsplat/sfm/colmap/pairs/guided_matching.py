@@ -11,8 +11,6 @@ features in their own photos: a structure that repeats does so there, too, and t
 thousands of unrelated features is equally near in any photo of the scene.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -4,8 +4,6 @@ The criteria are those of COLMAP's exact matching on the CPU. This module is imp
 process of COLMAP, so it does not import torch.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

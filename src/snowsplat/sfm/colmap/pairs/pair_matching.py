@@ -1,7 +1,5 @@
 """Matches the features of pairs of photos, and verifies the matches, in the COLMAP database."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor

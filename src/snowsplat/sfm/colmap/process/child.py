@@ -1,7 +1,5 @@
 """Runs the COLMAP worker as a child process, reports its progress and handles its failures."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

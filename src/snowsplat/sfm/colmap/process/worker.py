@@ -9,8 +9,6 @@ immediately. The child ignores Ctrl-C, which the parent handles. The output of C
 stderr, which the parent redirects to a log file.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import json
 import os

@@ -15,8 +15,6 @@ Two measures are taken for each pixel of small grey copies of the photos.
 The black outside of an image circle is found first (`image_circle`).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

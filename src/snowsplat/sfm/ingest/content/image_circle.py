@@ -4,8 +4,6 @@ The edge of the disc does not move with the scene, so its features are false mat
 would put the black corners in front of every camera.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

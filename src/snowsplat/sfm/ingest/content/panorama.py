@@ -5,8 +5,6 @@ a circle of latitude, so the left and the right border are neighbours, and the f
 row are one point each.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ All functions use small grey copies of images, (H, W) uint8. The copies contain 
 needs, and little noise.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from PIL import Image

@@ -5,8 +5,6 @@ background is masked: what the object never covers, and in each photo what it do
 The latter is compared with the backdrop, the grey level that most photos have in common.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

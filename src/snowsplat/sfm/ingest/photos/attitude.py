@@ -10,8 +10,6 @@
 Values are untrusted: what is damaged, implausible or of another convention is ignored.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

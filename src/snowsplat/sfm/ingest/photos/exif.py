@@ -10,8 +10,6 @@ Some drones round the position in EXIF to whole arc seconds, which are 30 m: mor
 a house. So the position in XMP is used, if it agrees with that in EXIF. Values are untrusted.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

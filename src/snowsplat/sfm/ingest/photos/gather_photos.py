@@ -3,8 +3,6 @@
 First, `plan_photos` reads only the headers. Then `write_photos` decodes every photo.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

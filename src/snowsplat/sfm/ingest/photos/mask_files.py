@@ -1,7 +1,5 @@
 """Reads and writes masks of photos. SfM and training ignore black and transparent mask pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ See `fixed_parts` for what this is and how it is found. Photos are compared with
 camera and size, frames with those of the same video.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -4,8 +4,6 @@ A zip file may come from a stranger. Nothing is written outside of the new folde
 created, and the unpacked size is bounded by the size of the file.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import stat

@@ -5,8 +5,6 @@ evaluation. Copies are equal files, and files whose names say that they may be c
 and IMG_1.JPG, "IMG_1 (1).jpg", images_4/IMG_1.jpg) and whose pixels agree.
 """
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import os

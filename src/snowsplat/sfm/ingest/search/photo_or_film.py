@@ -3,8 +3,6 @@
 Phones save a video of three seconds with every photo; cameras save a small photo with every video.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from snowsplat.project.left_out import LeftOut

@@ -1,7 +1,5 @@
 """Finds the input files: photos and videos, their names in ``input/``, and their masks."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence

@@ -3,8 +3,6 @@
 The motion is how far the image content moves, as `motion.FrameMotion` measures it.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass

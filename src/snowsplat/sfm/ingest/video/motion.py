@@ -7,8 +7,6 @@ the blocks with texture. So neither a person who walks through the scene nor noi
 light counts as motion. A rotation or zoom of the camera does, because it shifts most blocks.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from PIL import Image
 
