@@ -93,8 +93,6 @@ def density_control(settings: Any, count: int, **state: Any) -> DensityControl:
             training starts from random points instead of SfM points; generator, a random generator
             on the CPU; device, of the Gaussians, default: the CPU; shards, the processes of the
             training, default: this one alone.
-
-    Raises: UserError: see `check_overrides`.
     """
     if hasattr(settings, "control"):
         made: DensityControl = settings.control(count, **state)

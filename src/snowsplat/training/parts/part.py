@@ -111,7 +111,6 @@ class Part:
     idle: bool = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Raises: UserError: see `check_overrides`."""
         super().__init_subclass__(**kwargs)
         if "name" not in vars(cls):
             cls.name = cls.__name__
