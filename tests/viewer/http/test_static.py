@@ -8,6 +8,7 @@ import socket
 import threading
 
 import pytest
+from starlette.requests import Request
 
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.hosts import NO_TOKEN, KnownHosts
@@ -291,6 +292,24 @@ def test_a_browser_that_disconnects_during_a_download(capfd, caplog):
                 client.sendall(garbage)
         assert len(ask(server, "big")[1]) == 64 << 20
     assert capfd.readouterr() == ("", "")
+    assert not caplog.records
+
+
+def test_a_browser_that_disconnects_during_an_upload(caplog):
+    ended = threading.Event()
+
+    async def app(scope, receive, send):
+        try:
+            await Request(scope, receive).body()
+        finally:
+            ended.set()
+
+    with WebServer(app, headers=POLICY) as server:
+        path = "/" + server.url.split("/", 3)[3]
+        with socket.create_connection(("127.0.0.1", server.port)) as client:
+            head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
+            client.sendall(f"{head}half".encode())
+        assert ended.wait(60)
     assert not caplog.records
 
 

@@ -18,6 +18,7 @@ import logging
 from collections.abc import Mapping
 from http import HTTPStatus
 
+from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
@@ -42,7 +43,13 @@ _ALWAYS = {
 LOOK = "snowsplat.look"
 _log = logging.getLogger(__name__)
 
-_DISCONNECTED = (ConnectionError, TimeoutError, ClientDisconnected, WebSocketDisconnect)
+_DISCONNECTED = (
+    ConnectionError,
+    TimeoutError,
+    ClientDisconnect,
+    ClientDisconnected,
+    WebSocketDisconnect,
+)
 
 
 class Guard:
@@ -76,7 +83,7 @@ class Guard:
         try:
             await (self._refusal(scope) or self._app)(scope, receive, send_with_headers)
         except Exception as error:
-            # A browser that disconnects during a download is not an error.
+            # A browser that disconnects during a transfer is not an error.
             if not isinstance(error, _DISCONNECTED):
                 _log.error("web server: %s: %s", type(error).__name__, error, exc_info=True)
             if started:  # the connection is closed
