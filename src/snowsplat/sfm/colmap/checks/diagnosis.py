@@ -166,7 +166,8 @@ def failure(evidence: Evidence, doubts: Sequence[Message] = ()) -> UserError:
     if evidence.flat:
         return UserError(
             "photos: the camera only rotated, or the scene is flat, so depth cannot be estimated; "
-            "walk around a scene that has depth"
+            "walk around a scene that has depth; if an object turns, put the camera on a tripod, "
+            "because only a still background is masked"
         )
     if doubts:
         return UserError(
