@@ -166,7 +166,7 @@ def failure(evidence: Evidence, doubts: Sequence[Message] = ()) -> UserError:
     if evidence.flat:
         return UserError(
             "photos: the camera only rotated, or the scene is flat, so depth cannot be estimated; "
-            "walk around a scene that has depth; if an object turns, put the camera on a tripod, "
+            "walk around a scene that has depth, or put the camera on a tripod if an object turns, "
             "because only a still background is masked"
         )
     if doubts:
