@@ -11,13 +11,13 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from snowsplat.cli.reference_flags import PROGRAMS
+from snowsplat.cli.reference_flags import programs
 
 
 def markdown() -> str:
     """One table for each program."""
     lines: list[str] = []
-    for subcommand, (program, _) in PROGRAMS.items():
+    for subcommand, (program, _) in programs().items():
         lines += [f"| `{program}` | `snowsplat {subcommand}` |", "|---|---|"]
         lines += [f"| {spellings} | {what} |" for spellings, what in table(subcommand)]
         lines.append("")
@@ -26,7 +26,7 @@ def markdown() -> str:
 
 def table(subcommand: str) -> Iterator[tuple[str, str]]:
     """The spellings of each flag of a program, and what becomes of it, as Markdown."""
-    for flag in PROGRAMS[subcommand][1]:
+    for flag in programs()[subcommand][1]:
         note = flag.note.replace("|", "\\|")
         what = {
             "own": "the same",

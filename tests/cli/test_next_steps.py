@@ -9,7 +9,7 @@ from tests.gaussians import gaussians_in_box
 
 from snowsplat.cli.command import next_step, see_and_share
 from snowsplat.cli.main import SUBCOMMANDS
-from snowsplat.cli.subcommands import _WORDS
+from snowsplat.cli.subcommands import known_words
 from snowsplat.formats import write_gaussians
 from snowsplat.util import messages
 from snowsplat.util.messages import message
@@ -38,7 +38,7 @@ def test_words_that_are_no_subcommand(refused, scene, monkeypatch):
     assert "publish" in refused("share")
     assert "use points (a dense cloud), or mesh" in refused("pointcloud")
     assert f"snowsplat view {scene}; or: snowsplat info {scene}" in refused(scene)
-    for hint, words in _WORDS.items():
+    for hint, words in known_words().items():
         assert re.match(r"use (\w+)", hint)[1] in SUBCOMMANDS
         assert not set(words.split()) & set(SUBCOMMANDS)
 

@@ -6,7 +6,7 @@ import pytest
 
 from snowsplat.cli import main as cli
 from snowsplat.cli.flag_errors import _FLAGS, spellings
-from snowsplat.cli.reference_flags import PROGRAMS
+from snowsplat.cli.reference_flags import programs
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand
 
 # The command lines of the programs, from their documentation: a value where a flag takes one.
@@ -62,7 +62,7 @@ CASES = [
 
 
 def test_the_table_has_every_flag_and_no_other():
-    for subcommand, (_, flags) in PROGRAMS.items():
+    for subcommand, (_, flags) in programs().items():
         listed = [spelling for flag in flags for spelling in flag.spellings]
         assert len(listed) == len(set(listed))
         documented = {words[0].partition("=")[0] for name, words in CASES if name == subcommand}
@@ -73,7 +73,7 @@ def test_the_table_has_every_flag_and_no_other():
 def test_a_flag_is_done_or_without_effect_or_refused(subcommand, words, capsys):
     """What remains is a valid command line of the subcommand."""
     name = words[0].partition("=")[0]
-    (flag,) = (f for f in PROGRAMS[subcommand][1] if name in f.spellings)
+    (flag,) = (f for f in programs()[subcommand][1] if name in f.spellings)
     arguments = [subcommand, *BASE[subcommand], *words]
     if flag.outcome == "refused":
         with pytest.raises(cli.UserError, match=rf"^{name}: .*use {REFUSED[name]}"):

@@ -8,6 +8,7 @@ from the reference implementation" shows this table.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -29,12 +30,21 @@ class ReferenceFlag:
     only_with: str | None = None  # it is ignored, with the note, without this flag
 
 
-#: The name of the subcommand -> its program in the reference implementation, and the flags; the
-#: table is in `reference_flags.json`.
-PROGRAMS: dict[str, tuple[str, tuple[ReferenceFlag, ...]]] = {
-    subcommand: (each["program"], tuple(from_json(ReferenceFlag, f) for f in each["flags"]))
-    for subcommand, each in read_json(Path(__file__).with_suffix(".json")).items()
-}
+@cache
+def programs() -> dict[str, tuple[str, tuple[ReferenceFlag, ...]]]:
+    """The name of the subcommand -> its program in the reference implementation, and the flags, as
+    in `reference_flags.json`; some of them are shared."""
+    table = read_json(Path(__file__).with_suffix(".json"))
+    return {
+        subcommand: (
+            each["program"],
+            tuple(
+                from_json(ReferenceFlag, flag)
+                for flag in [*(table["shared"] if each.get("shares") else ()), *each["flags"]]
+            ),
+        )
+        for subcommand, each in table["programs"].items()
+    }
 
 
 def translated(subcommand: str, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -42,7 +52,7 @@ def translated(subcommand: str, arguments: Sequence[str]) -> tuple[list[str], li
 
     Raises: UserError: a flag is refused; the message names what to use instead.
     """
-    _, flags = PROGRAMS.get(subcommand, ("", ()))
+    _, flags = programs().get(subcommand, ("", ()))
     known = {s.replace("_", "-"): flag for flag in flags for s in flag.spellings}
     result: list[str] = []
     notes: list[str] = []

@@ -62,15 +62,18 @@ def load_subcommand(name: str) -> type[Command]:
     return SUBCOMMANDS[name].load()
 
 
-# What to use for words that people try.
-_WORDS: dict[str, str] = read_json(Path(__file__).with_name("words.json"))
+def known_words() -> dict[str, str]:
+    """What to use -> the words that people try, with spaces between them."""
+    found: dict[str, str] = read_json(Path(__file__).with_name("words.json"))
+    return found
 
 
 def advice(word: str) -> str | None:
     """What to use for a word that is no subcommand, such as "export"; None if it is not known."""
     word = word.lower().removeprefix("ns-")
     names = (word, word.removesuffix(".py"))
-    return next((hint for n in names for hint, words in _WORDS.items() if n in words.split()), None)
+    known = known_words()
+    return next((hint for n in names for hint, words in known.items() if n in words.split()), None)
 
 
 def overview() -> str:

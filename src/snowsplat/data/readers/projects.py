@@ -7,8 +7,6 @@ from snowsplat.data.readers.pose_matrices import without_camera
 from snowsplat.util.messages import Message
 from snowsplat.util.safe_json import read_json
 
-# The ending of a file name: what it is, and what to do.
-_PROJECTS: dict[str, tuple[str, str]] = read_json(Path(__file__).with_suffix(".json"))
 #: How deep in a dataset such files, and exports, are searched: kapture/mapping/sensors,
 #: MeshroomCache/StructureFromMotion/UID.
 DEEPEST = 3
@@ -17,13 +15,15 @@ DEEPEST = 3
 def advice(path: Path) -> str | Message | None:
     """What a file, or the first such file in a folder or below, is and what to do, as the end of a
     message; or None."""
+    # The ending of a file name: what it is, and what to do.
+    projects: dict[str, tuple[str, str]] = read_json(Path(__file__).with_suffix(".json"))
     folders = [path] if path.is_file() else list(folders_below(path, DEEPEST))
     for folder in folders:
         try:
             names = [path.name] if path.is_file() else sorted(p.name for p in folder.iterdir())
         except OSError:
             continue
-        for ending, (kind, action) in _PROJECTS.items():
+        for ending, (kind, action) in projects.items():
             for name in names:
                 here = f"{folder.name}/{name}".lower().endswith(ending)
                 if here and "images.bin" not in names:  # a whole COLMAP model
