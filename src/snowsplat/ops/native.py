@@ -1,7 +1,7 @@
 """Launches native functions on the CPU or on a GPU. Only this module distinguishes devices.
 
 At the first launch on the CPU, `util/native_library.py` loads the library for the best instruction
-set. A GPU has the same entries: see `ops/cuda`.
+set. A GPU has the same entries: see `ops/cuda` and `ops/webgpu`.
 """
 
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from snowsplat.ops import cuda
+from snowsplat.ops import cuda, webgpu
 from snowsplat.util import native_library
 from snowsplat.util.errors import UserError
 from snowsplat.util.native_layout import Fields
@@ -94,4 +94,5 @@ def query_size(name: str, device: torch.device, n: int = 0, tiles: int = 0, part
 LAUNCHERS: dict[str, Callable[[str, Fields], int]] = {
     "cpu": native_library.call,
     "cuda": cuda.launch,
+    "webgpu": webgpu.launch,
 }
