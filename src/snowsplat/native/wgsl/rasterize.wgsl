@@ -192,7 +192,7 @@ fn rasterize_fwd(@builtin(workgroup_id) group: vec3<u32>,
       batch_opacity_color[thread] = s.opacity_color;
       batch_color_23[thread] = s.color_23;
       for (var r = 0u; r < 8; r++) {
-        if ((s.rectangles >> r & 1) != 0) {
+        if (((s.rectangles >> r) & 1) != 0) {
           atomicOr(&touching[8 * r + thread / 32], 1u << (thread % 32));
         }
       }
@@ -326,7 +326,7 @@ fn rasterize_bwd(@builtin(workgroup_id) group: vec3<u32>,
       for (var j = 0u; j < min(kGroup, size - first); j++) {
         let i = first + j;
         var pair = vec2(0.0);
-        if (transmittance > 0 && (rectangles[i] >> (thread / 32) & 1) != 0) {
+        if (transmittance > 0 && ((rectangles[i] >> (thread / 32)) & 1) != 0) {
           let opacity_color = opacity_colors[i];
           let b = blend(position, transmittance, mean_conics[i], opacity_color);
           transmittance = b.transmittance;
@@ -420,11 +420,11 @@ fn background_bwd(@builtin(workgroup_id) group: vec3<u32>,
     }
     if (thread == 0) {
       let bits = bitcast<u32>(row_sums[0]);
-      let exponent = bits >> 23 & 255;
+      let exponent = (bits >> 23) & 255;
       let high = select(select(exponent + 896, 2047u, exponent == 255), 0u, exponent == 0);
       let fraction = select(bits & 0x7fffff, 0u, exponent == 0);
       rows[2 * (y * params.channels + k)] = fraction << 29;
-      rows[2 * (y * params.channels + k) + 1] = (bits & 0x80000000) | high << 20 | fraction >> 3;
+      rows[2 * (y * params.channels + k) + 1] = (bits & 0x80000000) | (high << 20) | (fraction >> 3);
     }
     workgroupBarrier();
   }

@@ -35,28 +35,32 @@ fn add(a: u32, b: u32) -> u32 {
   return select(a + b, 0xffffffffu, a > 0xffffffffu - b);
 }
 
-var<workgroup> partial: array<u32, 256>;
+var<workgroup> each: array<u32, 256>;
+var<workgroup> of_16: array<u32, 16>;  // sums of 16 threads
 var<workgroup> whole: u32;
 
-// The sum of the values of the threads before this one; `whole` becomes that of all.
+// The sum of the values of the threads before this one; `whole` becomes that of all. In two levels,
+// because barriers are what takes time in drivers that compute on the CPU.
 fn sum_before(value: u32, thread: u32) -> u32 {
-  partial[thread] = value;
+  each[thread] = value;
   workgroupBarrier();
-  for (var step = 1u; step < kThreads; step *= 2) {
-    var sum = partial[thread];
-    if (thread >= step) {
-      sum = add(partial[thread - step], sum);
+  if (thread < 16) {
+    var sum = 0u;
+    for (var k = 16 * thread; k < 16 * thread + 16; k++) {
+      sum = add(sum, each[k]);
     }
-    workgroupBarrier();
-    partial[thread] = sum;
-    workgroupBarrier();
+    of_16[thread] = sum;
+  }
+  workgroupBarrier();
+  var before = 0u;
+  for (var k = 0u; k < thread / 16; k++) {
+    before = add(before, of_16[k]);
+  }
+  for (var k = thread / 16 * 16; k < thread; k++) {
+    before = add(before, each[k]);
   }
   if (thread == kThreads - 1) {
-    whole = partial[thread];
-  }
-  var before = 0u;
-  if (thread > 0) {
-    before = partial[thread - 1];
+    whole = add(before, value);
   }
   workgroupBarrier();
   return before;
@@ -159,26 +163,33 @@ fn sort_count(@builtin(workgroup_id) group: vec3<u32>,
   }
 }
 
-// One workgroup per digit. Replaces each count with that of the blocks before.
+// Replaces each count with that of the blocks before. A workgroup processes 16 digits, with 16
+// threads for each, of which each has a part of the blocks.
 @compute @workgroup_size(256)
 fn sort_offsets(@builtin(workgroup_id) group: vec3<u32>,
                 @builtin(local_invocation_index) thread: u32) {
   let blocks = (params.n + kBlock - 1) / kBlock;
-  let row = group.x * blocks;
-  var carry = 0u;
-  for (var first = 0u; first < blocks; first += kThreads) {
-    var value = 0u;
-    if (first + thread < blocks) {
-      value = counts[row + first + thread];
-    }
-    let before = sum_before(value, thread);
-    if (first + thread < blocks) {
-      counts[row + first + thread] = carry + before;
-    }
-    carry += workgroupUniformLoad(&whole);
+  let digit = group.x * 16 + thread / 16;
+  let size = (blocks + 15) / 16;
+  let begin = digit * blocks + min(thread % 16 * size, blocks);
+  let end = digit * blocks + min((thread % 16 + 1) * size, blocks);
+  var sum = 0u;
+  for (var i = begin; i < end; i++) {
+    sum += counts[i];
   }
-  if (thread == 0) {
-    totals[group.x] = carry;
+  each[thread] = sum;
+  workgroupBarrier();
+  var before = 0u;
+  for (var k = thread / 16 * 16; k < thread; k++) {
+    before += each[k];
+  }
+  for (var i = begin; i < end; i++) {
+    let here = counts[i];
+    counts[i] = before;
+    before += here;
+  }
+  if (thread % 16 == 15) {
+    totals[digit] = before;
   }
 }
 
@@ -194,13 +205,16 @@ fn sort_scatter(@builtin(workgroup_id) group: vec3<u32>,
                 @builtin(local_invocation_index) thread: u32) {
   let block = group.y * groups.x + group.x;
   let blocks = (params.n + kBlock - 1) / kBlock;
+  if (block * kBlock >= valid_pairs()) {
+    return;
+  }
   let before_digit = sum_before(totals[thread], thread);
-  next[thread] = before_digit + counts[thread * blocks + min(block, blocks - 1)];
+  next[thread] = before_digit + counts[thread * blocks + block];
+  for (var w = 0u; w < 8; w++) {
+    atomicStore(&having[8 * thread + w], 0u);
+  }
+  workgroupBarrier();
   for (var k = 0u; k < kItems; k++) {
-    for (var w = 0u; w < 8; w++) {
-      atomicStore(&having[w * kThreads + thread], 0u);
-    }
-    workgroupBarrier();
     let i = block * kBlock + k * kThreads + thread;
     let is_valid = i < valid_pairs();
     var key = 0u;
@@ -226,7 +240,7 @@ fn sort_scatter(@builtin(workgroup_id) group: vec3<u32>,
     }
     workgroupBarrier();
     for (var w = 0u; w < 8; w++) {
-      next[thread] += countOneBits(atomicLoad(&having[8 * thread + w]));
+      next[thread] += countOneBits(atomicExchange(&having[8 * thread + w], 0u));
     }
     workgroupBarrier();
   }

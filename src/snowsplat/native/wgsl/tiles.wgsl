@@ -213,57 +213,43 @@ fn tiles_start(@builtin(workgroup_id) group: vec3<u32>,
   binning_tile_start[tile] = low;
 }
 
-var<workgroup> sum_of: array<f32, 256>;
-
-// 16 threads for each splat, of which nine or ten sum a column of its slots: three or four colours,
-// then six moments.
-@compute @workgroup_size(256)
+// One thread per splat: the sums of the columns of its slots, three or four colours and six moments.
+@compute @workgroup_size(64)
 fn splats_reduce(@builtin(workgroup_id) group: vec3<u32>,
                  @builtin(num_workgroups) groups: vec3<u32>,
                  @builtin(local_invocation_index) thread: u32) {
-  let i = item(group, groups, thread) / 16;
-  let lane = thread % 16;
-  let moments = select(4u, 3u, params.channels <= 3);
-  var begin = 0u;
-  var end = 0u;
-  if (i < params.n) {
-    begin = slot_range[2 * i];
-    end = slot_range[2 * i + 1];
+  let i = (group.y * groups.x + group.x) * 64 + thread;
+  if (i >= params.n) {
+    return;
   }
-  var sum = 0.0;
-  if (lane < moments + 6) {
-    for (var s = begin; s < end; s++) {
-      sum += slots[16 * s + lane];
-    }
-  }
-  sum_of[thread] = sum;
-  workgroupBarrier();
-  if (i >= params.n || (params.add != 0 && begin == end)) {
+  let begin = slot_range[2 * i];
+  let end = slot_range[2 * i + 1];
+  if (params.add != 0 && begin == end) {
     return;
   }
   let row = i * params.stride;
   let conic = vec3(packed[row + 2], packed[row + 3], packed[row + 4]);
-  if (params.has_abs_grad != 0 && lane < 2) {
-    let factors = select(conic.yz, conic.xy, lane == 0);
-    var abs_sum = 0.0;
-    for (var s = begin; s < end; s++) {
-      let q = 16 * s + moments;
-      abs_sum += abs(factors.x * slots[q + 1] + factors.y * slots[q + 2]);
+  let q = select(4u, 3u, params.channels <= 3);  // the column of the first moment
+  var sums = array<f32, 10>();
+  var abs_sum = vec2(0.0);
+  for (var s = begin; s < end; s++) {
+    for (var k = 0u; k < q + 6; k++) {
+      sums[k] += slots[16 * s + k];
     }
-    abs_grad[2 * i + lane] += abs_sum;
+    let moments = vec2(slots[16 * s + q + 1], slots[16 * s + q + 2]);
+    abs_sum += abs(vec2(dot(conic.xy, moments), dot(conic.yz, moments)));
   }
-
-  let first = thread - lane;
-  let q = first + moments;
+  if (params.has_abs_grad != 0) {
+    abs_grad[2 * i] += abs_sum.x;
+    abs_grad[2 * i + 1] += abs_sum.y;
+  }
   var geometry = array<f32, 6>();
   if (begin < end) {
-    let qx = sum_of[q + 1];
-    let qy = sum_of[q + 2];
-    geometry = array<f32, 6>(conic.x * qx + conic.y * qy, conic.y * qx + conic.z * qy,
-                             -0.5 * sum_of[q + 3], -sum_of[q + 4],
-                             -0.5 * sum_of[q + 5], sum_of[q] / packed[row + 5]);
+    let moments = vec2(sums[q + 1], sums[q + 2]);
+    geometry = array<f32, 6>(dot(conic.xy, moments), dot(conic.yz, moments), -0.5 * sums[q + 3],
+                             -sums[q + 4], -0.5 * sums[q + 5], sums[q] / packed[row + 5]);
   }
-  for (var column = lane; column < params.stride; column += 16) {
+  for (var column = 0u; column < params.stride; column++) {
     var value = 0.0;
     if (params.add != 0) {
       value = grad_packed[row + column];
@@ -273,7 +259,7 @@ fn splats_reduce(@builtin(workgroup_id) group: vec3<u32>,
     }
     for (var k = 0u; k < params.channels; k++) {
       if (i32(column) == columns[2 * k]) {
-        value += sum_of[first + k];
+        value += sums[k];
       }
     }
     grad_packed[row + column] = value;
