@@ -54,7 +54,7 @@ def test_the_sum_of_the_stages(now):
     every = sum(step.work for name, step in steps.items() if name != "start")
     left = of_sfm()
     assert first_report(left, "photos", 0, 50, "photos") == pytest.approx(every, abs=0.1)
-    left = of_sfm(work=300.0)
+    left = of_sfm(seconds=300.0)
     assert first_report(left, "photos", 0, 50, "photos") == pytest.approx(every + 300.0, abs=0.1)
     left = of_sfm(deadline=now[0] + 5000.0)
     assert first_report(left, "photos", 0, 50, "photos") == 5000.0

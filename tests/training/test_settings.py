@@ -151,6 +151,7 @@ WRONG_OPTIONS = [
     ("memory", "much", "much", "'much' is not a size; use e.g. 4GB or 800MB"),
     ("memory", 0, "0", "; use e.g. 4GB or 800MB"),
     ("save_iterations", ("a",), "a", "use a list; each item is a whole number"),
+    ("last_part", -1.0, None, "-1.0 is too small"),
     ("checkpoint_seconds", -1.0, None, "-1.0 is too small"),
     ("settings", "fast", None, "has the wrong type"),
 ]

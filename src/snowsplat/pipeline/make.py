@@ -3,6 +3,7 @@
 If the input is a dataset, its camera poses are used, unless they are impossible.
 """
 
+import itertools
 import math
 import shutil
 import time
@@ -14,6 +15,7 @@ from typing import Any
 
 from snowsplat import ops
 from snowsplat.data import Dataset, read_dataset
+from snowsplat.data.photos.image_loader import after_each_photo
 from snowsplat.pipeline.all_photos import SHARE, train_on_all
 from snowsplat.pipeline.make_plan import (
     POSES_SHARE,
@@ -23,6 +25,7 @@ from snowsplat.pipeline.make_plan import (
     expected,
     expected_seconds,
     given_poses,
+    training_seconds,
 )
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.make import PRESETS, MakeOptions, Preset
@@ -241,8 +244,15 @@ class _Job:
         def on_change(reason: str) -> None:
             self.observer.inform("{name}: repeated ({reason})", name=name, reason=reason)
 
-        self.observer.begin(name)
-        outcome = self.stages.run(name, settings, outputs, work, on_change)
+        def photo_is_prepared() -> None:
+            left = None
+            if name == "scene" and self._training_seconds:
+                left = max(1.0, self._training_seconds - (time.monotonic() - began))
+            report(next(count), 0, "prepared photos", left)
+
+        report, count, began = self.observer.begin(name), itertools.count(1), time.monotonic()
+        with after_each_photo(photo_is_prepared):
+            outcome = self.stages.run(name, settings, outputs, work, on_change)
         self.observer.end(name, outcome)
         return outcome.result
 
@@ -254,13 +264,15 @@ class _Job:
         """
         quality, minutes = self.options.quality, self.options.minutes
         if minutes is None or self.given is not None:
-            quality = quality or "normal"
+            plan = MakePlan(quality or "normal", PRESETS[quality or "normal"].photos)
             if minutes is None and "title" not in self.stages.about and self._on_cpu():
                 photos = survey(self.sources)
                 speed = measure_speed(self.options.compute.threads or ops.get_num_threads())
-                seconds = expected_seconds(quality, photos, speed, self.given is None)
-                self.observer.note(expected(quality, photos, seconds))
-            return MakePlan(quality, PRESETS[quality].photos)
+                seconds = expected_seconds(plan.quality, photos, speed, self.given is None)
+                self.observer.note(expected(plan.quality, photos, seconds))
+                later = training_seconds(plan.quality, photos.count, speed)
+                self.stages.about["training_seconds"] = later
+            return plan
         photos = survey(self.sources)
         about = {"minutes": minutes, "quality": quality, "photos": asdict(photos)}
         before = self.stages.about.get("plan", {})
@@ -282,7 +294,9 @@ class _Job:
             ),
             marker=self.options.marker,
         )
-        later = self._later(plan)
+        later = Later(self._training_seconds)
+        if self.options.minutes is not None:
+            later = Later(deadline=self.started + 60.0 * self.options.minutes)
         outcomes = make_dataset(
             self.sources, self.dataset.path, options, self.observer, self.overwrite, later
         )
@@ -291,13 +305,12 @@ class _Job:
             self.name = before  # the photos are the same, if their folder was renamed, too
         self.stages.about["name"] = self.name
 
-    def _later(self, plan: MakePlan) -> Later:
-        """The work after the dataset is made, for the estimate of the time left."""
-        if self.options.minutes is not None:
-            return Later(deadline=self.started + 60.0 * self.options.minutes)
-        if not self._on_cpu():
-            return Later()  # on a GPU, the training takes a small part of the time
-        return Later(work=PRESETS[plan.quality].training)
+    @property
+    def _training_seconds(self) -> float:
+        """As predicted in the first run; 0 with a time budget, and on a GPU, where the training
+        takes a small part of the time."""
+        seconds = self.stages.about.get("training_seconds")
+        return seconds if isinstance(seconds, float) else 0.0
 
     def _on_cpu(self) -> bool:
         return ops.resolve_device(self.options.compute.device).type == "cpu"
@@ -333,6 +346,7 @@ class _Job:
         options = TrainOptions(
             memory=self.options.memory,
             checkpoint_seconds=_CHECKPOINT_SECONDS,
+            last_part=0.0 if self.options.hold_out is None else SHARE,
             compute=self.options.compute,
         )
         same = self.stages.about.get("training") == settings

@@ -126,10 +126,15 @@ def expected(quality: Quality, photos: Photos, seconds: float) -> Message:
 
 def expected_seconds(quality: Quality, photos: Photos, speed: Speed, poses: bool = True) -> float:
     """The predicted time of `make` on the CPU; ``poses``: whether they are estimated."""
+    size = PRESETS[quality].photos
+    before = predicted_seconds(photos, size, quality, speed) if poses else 0.0
+    return before + training_seconds(quality, photos.count, speed)
+
+
+def training_seconds(quality: Quality, photos: int, speed: Speed) -> float:
+    """The predicted time of `make` on the CPU after the poses are known."""
     preset = PRESETS[quality]
-    training = Step(preset.training).seconds(speed)
-    before = predicted_seconds(photos, preset.photos, quality, speed) if poses else 0.0
-    return before + training
+    return Step(preset.training + preset.training_per_photo * photos).seconds(speed)
 
 
 def _counted(plan: MakePlan, photos: Photos) -> Message:

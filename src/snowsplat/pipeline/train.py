@@ -322,7 +322,8 @@ class _Job:
                 free=format_bytes(free),
                 most=format_bytes(most),
             )
-        work = Work.for_training(trainer.config, trainer.dataset)
+        last_part = self.request.options.last_part
+        work = Work.for_training(trainer.config, trainer.dataset, last_part)
         pace = Pace(work)
         if budget is not None:
             pace = Pace(work, budget.left, plan.time_ratio if plan else 1.0)

@@ -48,7 +48,7 @@ _STEPS_OF_STAGE = {
 class Later:
     """The part of a job after structure from motion."""
 
-    work: float = 0.0  # seconds of one core of the reference machine; all threads work
+    seconds: float = 0.0  # on this machine
     # When the job will end because of its time budget, by `time.monotonic`; None: there is no time
     # budget.
     deadline: float | None = None
@@ -67,11 +67,11 @@ class SfmTimeLeft:
             later: the part of the job after structure from motion.
         """
         self._photos, self._size, self._effort = photos, size, effort
-        self._deadline, self._speed = later.deadline, Speed(1.0, threads)
+        self._later, self._speed = later, Speed(1.0, threads)
         steps = steps_of(photos, size, effort)
         del steps["start"]  # its time is spread over other steps, so it is not measured
         self._predicted = dict[str, float]()  # seconds of each step, in their order
-        self.expect({**steps, "later": Step(later.work)})
+        self.expect(steps)
         # For each step: the seconds that were measured, and the predicted ones of the same work.
         self._measured = dict.fromkeys(self._predicted, 0.0)
         self._finished = dict.fromkeys(self._predicted, 0.0)
@@ -105,8 +105,8 @@ class SfmTimeLeft:
             share = done / total if total else 0.0
             self.update(step, share_of_poses(done, total) if step == "poses" else share)
             left = self.seconds
-            if self._deadline is not None:
-                left = max(left, self._deadline - time.monotonic())
+            if self._later.deadline is not None:
+                left = max(left, self._later.deadline - time.monotonic())
             report(done, total, what, left)
 
         return with_time
@@ -128,12 +128,12 @@ class SfmTimeLeft:
 
     @property
     def seconds(self) -> float:
-        """Estimated seconds until the last step is finished."""
+        """Estimated seconds until the job is finished."""
         names = list(self._predicted)
         later = names[names.index(self._step) + 1 :]
         rest = (1.0 - self._share) * self._seconds(self._step) + sum(map(self._seconds, later))
         silence = time.monotonic() - self._last
-        return max(rest - silence, _SILENCE * silence)
+        return max(rest - silence, _SILENCE * silence) + self._later.seconds
 
     def _seconds(self, step: str) -> float:
         """Seconds of the whole step on this machine."""

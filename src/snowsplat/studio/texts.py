@@ -7,6 +7,7 @@ from snowsplat.util.safe_json import printable
 #: What stages count, see `sfm.progress.Report`: `in_languages` finds their Chinese by the English.
 ITEMS = (
     message("registered photos"),
+    message("prepared photos"),
     message("photos with features"),
     message("matched pairs"),
     message("verified pairs"),

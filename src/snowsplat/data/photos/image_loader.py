@@ -10,8 +10,10 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -32,10 +34,27 @@ _Result = TypeVar("_Result")
 _Key = tuple[ImageSource, ImageSource | None, int]  # image, mask, downscale factor
 
 
+_after_photo: ContextVar[Callable[[], None]] = ContextVar("after_photo", default=lambda: None)
+
+
+@contextmanager
+def after_each_photo(call: Callable[[], None]) -> Iterator[None]:
+    """A context in which `each_photo` calls ``call`` after each photo, to show its progress."""
+    token = _after_photo.set(call)
+    try:
+        yield
+    finally:
+        _after_photo.reset(token)
+
+
 def each_photo(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
     """The results of a function of photos, in the order of the items, by `DECODERS` threads."""
+    results, finished = [], _after_photo.get()
     with ThreadPoolExecutor(DECODERS, thread_name_prefix="snowsplat-photos") as pool:
-        return list(pool.map(function, items))
+        for result in pool.map(function, items):
+            results.append(result)
+            finished()
+    return results
 
 
 class Photos(Protocol):

@@ -73,13 +73,14 @@ class Preset:
     # max_gaussians, densify_interval: settings of the training; None: the value of the recipe.
     max_gaussians: int | None
     densify_interval: int | None
-    # About the time of the training and of the test views, in seconds of one core of the reference
-    # machine of `sfm.cost`.
+    # About the time of the training, of the test views and of the last part, and that of preparing
+    # each photo, in seconds of one core of the reference machine of `sfm.cost`.
     training: float
+    training_per_photo: float
 
 
 PRESETS: dict[Quality, Preset] = {
-    "draft": Preset(1600, 640, 1500, 60_000, 50, 120.0),
-    "normal": Preset(2400, 1000, 2000, None, None, 500.0),
-    "best": Preset(3200, 1600, 10_000, 250_000, None, 4000.0),
+    "draft": Preset(1600, 640, 1500, 60_000, 50, 155.0, 1.0),
+    "normal": Preset(2400, 1000, 2000, None, None, 600.0, 1.5),
+    "best": Preset(3200, 1600, 10_000, 250_000, None, 4600.0, 3.0),
 }

@@ -75,6 +75,9 @@ class TrainOptions(Settings):
         (), "Steps after which to save the scene, in addition to the last step.", least=-1
     )
     checkpoint_seconds: float | None = setting(None, "Time between checkpoints.", least=0.0)
+    last_part: float = setting(
+        0.0, "Steps that follow, relative to those of the training; for the time left.", least=0.0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

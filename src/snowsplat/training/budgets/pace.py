@@ -56,7 +56,7 @@ class Pace:
     """Call `after_step` after each step of a training run.
 
     Attributes:
-        end: when the last step is completed; with a time budget, when this is over.
+        end: when the scene is evaluated and written; with a time budget, when this is over.
     """
 
     def __init__(
@@ -84,6 +84,7 @@ class Pace:
         self._last_estimate = self._last_step if self._limited else -math.inf
         self._gaussians, self._growth = 0, GROWTH  # in the last step; by the last densification
         self.end = self._finish = self._last_step + (seconds or 0.0)
+        self._last_part = 0.0  # seconds after the end
 
     def after_step(
         self, schedule: Schedule, step: int, downscale: int, gaussians: int
@@ -105,12 +106,14 @@ class Pace:
             return None
         self._last_estimate = now
         growth = None if self._limited else self._growth
-        mean = self._cost.mean(self._work.parts_ahead(schedule, step, gaussians, growth))
+        ahead = self._work.parts_ahead(schedule, step, gaussians, growth)
+        mean, at_end = self._cost.mean(ahead), self._cost.predict(1, ahead[-1][1])
+        self._last_part = self._work.last_part * at_end
+        after = self._work.seconds_after(self._cost.predict(1, gaussians), gaussians)
         if not self._limited:
-            self.end = now + mean * (schedule.iterations - step)
+            self.end = now + mean * (schedule.iterations - step) + after
         if not self._limited or step >= schedule.iterations:
             return None
-        after = self._work.seconds_after(self._cost.predict(1, gaussians), gaussians)
         steps = round((self.end - now - after) / mean)
         fewest = math.ceil((1.0 - schedule.share(step)) * step / _MAX_SHORTENING)
         steps = max(steps, fewest, FEWEST_STEPS - step, 1)
@@ -119,8 +122,10 @@ class Pace:
 
     @property
     def seconds_left(self) -> float:
-        """The time from the last step to `end`, or longer if the budget does not suffice."""
-        return max(0.0, self.end - self._last_step, self._finish - self._last_step)
+        """The time from the last step to `end`, or longer if the budget does not suffice, and that
+        of the last part of the work."""
+        end = max(self.end, self._finish)
+        return max(0.0, end - self._last_step) + self._last_part
 
     def postpone(self, seconds: float) -> None:
         """The training has paused for ``seconds`` since the last step."""

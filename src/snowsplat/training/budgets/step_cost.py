@@ -29,6 +29,8 @@ _SECONDS_PER_MILLION_GAUSSIANS = 0.07
 _STEPS_PER_VIEW = 0.5
 #: Decoding the photo of a test view and computing the metrics.
 _SECONDS_PER_VIEW_MEGAPIXEL = 0.05
+#: Preparing a photo for the last part: decoding it, and comparing it with the scene.
+_STEPS_PER_PHOTO = 2.0
 #: Writing the scene, per million Gaussians.
 _SECONDS_PER_MILLION_WRITTEN = 4.0
 
@@ -58,17 +60,26 @@ class Work:
         config: the configuration; its coarse-to-fine stages and its densification are used.
         pixels: mean number of pixels of a photo at full resolution.
         held_out: number of test photos, which are evaluated at the end.
+        last_part: what follows the evaluation, in steps at full resolution. A time budget does not
+            contain it.
     """
 
     config: TrainConfig
     pixels: float
     held_out: int
+    last_part: float = 0.0
 
     @classmethod
-    def for_training(cls, config: TrainConfig, dataset: Dataset) -> Work:
-        """The work of training on ``dataset``."""
+    def for_training(cls, config: TrainConfig, dataset: Dataset, last_part: float = 0.0) -> Work:
+        """The work of training on ``dataset``.
+
+        ``last_part``: steps that follow with all photos, relative to those of the training.
+        """
         sizes = [view.camera.width * view.camera.height for view in dataset.train]
-        return cls(config, sum(sizes) / len(sizes), len(dataset.test))
+        more = last_part * config.iterations
+        if more:
+            more += _STEPS_PER_PHOTO * (len(dataset.train) + len(dataset.test))
+        return cls(config, sum(sizes) / len(sizes), len(dataset.test), more)
 
     def seconds(self, downscale: int, gaussians: float) -> float:
         """Seconds of one step on the machine of these constants."""
