@@ -14,7 +14,7 @@ from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.pipeline import all_photos
 from snowsplat.pipeline.all_photos import train_on_all
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.observer import SILENT
+from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.run.training_files import write_beginning, write_scene
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
@@ -95,6 +95,14 @@ def test_the_mean_of_the_exposures_stays_where_it_is(trained):
     assert before.abs().min() > 0.1
     trainer.run()
     assert torch.allclose(exposure.ev.mean(0), before, atol=1e-5)
+
+
+def test_it_tells_its_time_left(trained):
+    clock, left = Observer(), []
+    clock.step = lambda progress: left.append(progress.seconds_left)
+    train_on_all(trained, 200, math.inf, Compute("cpu", 1), clock)
+    assert len(left) == 24
+    assert 0.0 < left[-1] < left[5]
 
 
 def test_when_there_is_no_last_part(trained):

@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.pipeline.options.make import PRESETS
+from snowsplat.pipeline.make_plan import training_seconds
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera import Camera
@@ -133,7 +133,8 @@ def test_poses_that_are_given_take_no_time(library, tmp_path, monkeypatch):
     monkeypatch.setattr(worker, "measure_speed", lambda _: Speed())
     given, unknown = (worker.survey_photos(library.new("a", [each])) for each in (dataset, photos))
     assert (given["facts"]["poses"], unknown["facts"]["poses"]) == (True, False)
-    assert given["seconds"]["draft"] == PRESETS["draft"].training < unknown["seconds"]["draft"]
+    alone = round(training_seconds("draft", 9, Speed()))
+    assert given["seconds"]["draft"] == alone < unknown["seconds"]["draft"]
 
 
 def test_progress_is_bounded(library):

@@ -19,8 +19,10 @@ from snowsplat.pipeline.run.results import LastPart
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
+from snowsplat.training.budgets.pace import Pace
+from snowsplat.training.budgets.step_cost import Work
 from snowsplat.training.core.history import History
-from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.core.trainer import Progress, Trainer
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.parts.list import all_parts_of
 from snowsplat.training.parts.transients import KnownTransients
@@ -66,8 +68,8 @@ def train_on_all(
     steps = round(SHARE * iteration)
     if math.isfinite(seconds):
         last = History.read(folder.history, iteration).stretches[-_LAST_STRETCHES:]
-        pace = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
-        steps = min(steps, int(seconds / pace)) if pace > 0 else 0
+        mean = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
+        steps = min(steps, int(seconds / mean)) if mean > 0 else 0
     if steps < _LOOKS * len(views):
         return LastPart(why_not=message("it would use each photo less than twice")), None
     background = torch.tensor(scene.background, device=scene.gaussians.means.device)
@@ -94,8 +96,14 @@ def train_on_all(
     exposure = trainer.part(Exposure)
     if exposure is not None:
         exposure.continue_with(torch.tensor([exposures[view.name] for view in used]))
+    pace = Pace(Work.for_training(config, trainer.dataset))
+
+    def on_step(progress: Progress) -> None:
+        pace.after_step(trainer.schedule, progress.step, 1, progress.gaussians)
+        observer.step(replace(progress, seconds_left=pace.seconds_left))
+
     with observer.stepping(0, steps):
-        trainer.run(observer.step)
+        trainer.run(on_step)
     photos = len(scene.dataset.train) + len(scene.dataset.test)
     return LastPart(steps, len(views), photos - len(views)), trainer.gaussians.detach()
 

@@ -80,7 +80,7 @@ class Preset:
 
 
 PRESETS: dict[Quality, Preset] = {
-    "draft": Preset(1600, 640, 1500, 60_000, 50, 155.0, 1.0),
+    "draft": Preset(1600, 640, 1500, 60_000, 50, 130.0, 1.2),
     "normal": Preset(2400, 1000, 2000, None, None, 600.0, 1.5),
     "best": Preset(3200, 1600, 10_000, 250_000, None, 4600.0, 3.0),
 }
