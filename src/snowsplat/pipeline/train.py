@@ -173,6 +173,8 @@ class _Job:
         config = options.configuration()
         settings, files = read_undamaged(settings)
         dataset = files.dataset(settings.resolution)
+        if options.minutes is None:  # too little memory is refused before the photos are compared
+            plan_memory(dataset, config, self.device, budget=options.memory)
         trusted = options.trust_cameras
         self.doubts, wrong = check_cameras(dataset, settings.path, trusted=trusted)
         if wrong:
