@@ -172,8 +172,16 @@ def test_a_path_in_place_of_a_subcommand_is_answered_with_what_suits_it(refused,
     assert f"snowsplat view {scene}" in refused(scene)
 
 
-def test_a_misplaced_flag_is_found_in_its_subcommand(run):
-    assert "snowsplat train --help" in run("--iterations", "3").err
+def test_a_misplaced_flag_is_found_in_its_subcommand(refused):
+    assert "snowsplat train … --iterations" in refused("--iterations", "3")
+    assert "--none: unknown flag" in refused("--none", "3")
+
+
+def test_lists_of_a_fixed_length(refused):
+    """Values that are missing, and commas between them."""
+    for values in (["-1", "-1", "-1", "1", "1"], ["-1,-1,-1,1,1,1"]):
+        error = refused("convert", "a.ply", "b.ply", "--crop", *values)
+        assert f"{len(values)} given; use 6 values, each a number, separated by spaces" in error
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,8 @@ def test_parts_recipes_and_subcommands_of_a_file(run, refused, dataset, own, tmp
 def test_files_that_are_refused(refused, own, tmp_path):
     assert "is no Python file" in refused("info", tmp_path, "--import", tmp_path / "none.py")
     assert "is no Python file" in refused("info", tmp_path, "--import", tmp_path)
+    own.write_text("x = 1\ny = = 2\n")
+    assert f"{own}, line 2: invalid syntax" in refused("info", tmp_path, "--import", own)
     settings = tmp_path / "settings.json"
     settings.write_text(json.dumps({"import": str(own)}))
     assert "import: unknown" in refused("train", tmp_path, "-o", "out", "--config", settings)

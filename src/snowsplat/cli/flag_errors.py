@@ -20,7 +20,7 @@ from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
 from snowsplat.cli.command import Command
-from snowsplat.cli.subcommands import SUBCOMMANDS
+from snowsplat.cli.subcommands import SUBCOMMANDS, load_subcommand
 from snowsplat.training.settings.recipes import RECIPES
 from snowsplat.util.flags import flags_of
 from snowsplat.util.messages import Message, message
@@ -72,7 +72,15 @@ def explained(command: type[Command], arguments: Sequence[str], printed: str) ->
             else [*takewhile(lambda word: not _FLAG.match(word), arguments[number + 1 :])]
         )
         if get_origin(kinds[0]) is tuple:
-            kinds = [get_args(kinds[0])[0]]
+            items = get_args(kinds[0])
+            if Ellipsis not in items and len(texts) != len(items):
+                return message(
+                    "{flag}: {count} given; use {allowed}, separated by spaces",
+                    flag=spelling,
+                    count=len(texts),
+                    allowed=valid,
+                )
+            kinds = [items[0]]
         elif not texts:
             return message("{flag}: needs a value; use {allowed}", flag=spelling, allowed=valid)
         else:
@@ -96,6 +104,19 @@ def explained(command: type[Command], arguments: Sequence[str], printed: str) ->
     end = lines.index("") if "" in lines else len(lines)
     of_parser = " ".join(lines[:end]).rstrip(".")
     return Message(of_parser) if of_parser else message("invalid flags")
+
+
+def misplaced(flag: str) -> Message:
+    """Why the first argument must not be a flag, on one line."""
+    spelling = flag.partition("=")[0].replace("_", "-")
+    owners = [name for name in SUBCOMMANDS if spelling in spellings(load_subcommand(name))]
+    if not owners:
+        return message("{flag}: unknown flag; try: snowsplat --help", flag=printable(flag))
+    return message(
+        "{flag}: follows the name of a subcommand, as in: snowsplat {name} … {flag}",
+        flag=printable(flag),
+        name=owners[0],
+    )
 
 
 def spellings(command: type[Command]) -> dict[str, tuple[Any, Message]]:

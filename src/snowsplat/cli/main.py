@@ -123,11 +123,13 @@ def parse(arguments: Sequence[str]) -> Command:
         with redirect_stderr(printed):
             given = parser.parse(name, rest, commands)
     except SystemExit as ended:
-        if name.startswith("-") or not ended.code:
+        if not ended.code:
             sys.stderr.write(printed.getvalue())
             raise
-        from snowsplat.cli.flag_errors import explained
+        from snowsplat.cli.flag_errors import explained, misplaced
 
+        if name.startswith("-"):
+            raise UserError(misplaced(name)) from None
         raise UserError(explained(load_subcommand(name), rest, printed.getvalue())) from None
     command = load_subcommand(name)
     if "config" in given:

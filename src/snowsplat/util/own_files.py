@@ -25,7 +25,7 @@ def import_own_files(more: Iterable[str] = ()) -> None:
 
     What the code of a file raises is passed on.
 
-    Raises: UserError: there is no such Python file.
+    Raises: UserError: there is no such Python file, or it has an error of syntax.
     """
     files = list(dict.fromkeys([*own_files(), *map(os.path.abspath, more)]))
     for file in files:
@@ -37,6 +37,12 @@ def import_own_files(more: Iterable[str] = ()) -> None:
         if spec is None or spec.loader is None or not os.path.isfile(file):
             raise UserError("{file}: is no Python file; import a .py file", file=file)
         sys.modules[name] = module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
+        try:
+            spec.loader.exec_module(sys.modules[name])
+        except SyntaxError as error:
+            what, line = error.msg, error.lineno
+            raise UserError(
+                "{file}, line {line}: {what}", file=file, line=line, what=what
+            ) from None
     if files:
         os.environ[_VARIABLE] = os.pathsep.join(files)

@@ -242,7 +242,10 @@ def _words(kind: Any, declared: Setting) -> Message:
     if get_origin(kind) is Literal:
         return _alternatives([Message(str(value)) for value in get_args(kind)])
     if get_origin(kind) in (tuple, list):
-        item = allowed(get_args(kind)[0], declared)
+        first, *others = get_args(kind)
+        item = allowed(first, declared)
+        if others and Ellipsis not in others:
+            return message("{count} values, each {item}", count=1 + len(others), item=item)
         return message("a list; each item is {item}", item=item)
     if kind is int or kind is float:
         noun = message("a whole number") if kind is int else message("a number")
