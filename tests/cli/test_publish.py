@@ -55,6 +55,16 @@ def test_files(site, scene):
     assert poster[:, :40].max() < 20
 
 
+def test_a_page_that_trains(dataset, tmp_path, refused, run):
+    page = tmp_path / "learn.html"
+    told = refused("publish", "--trainable", dataset, "-o", page, "--licence", "CC0")
+    assert "--licence: is not for --trainable" in told
+    result = run("publish", "--trainable", dataset, "-o", page, "--title", "Balls")
+    assert result.code == 0
+    assert "9 photos, 300 Gaussians to begin with" in result.err + result.out
+    assert "<title>Balls</title>" in page.read_text("utf-8")
+
+
 def test_without_cameras_nobody_walks(scene, tmp_path, refused):
     assert "needs the cameras" in refused("publish", scene, "-o", tmp_path / "site", "--walk")
     assert not (tmp_path / "site").exists()
