@@ -28,13 +28,15 @@ _PLANE_OR_ROTATION = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
 # Share of the matches of a pair that move if the camera does. Others may be fixed to the frame. If
 # the camera stands still, people and leaves that move have fewer matches.
 _MOVING_SHARE = 0.25
-#: Poses are not compared with pairs that have fewer verified matches: unrelated photos can have
-#: about this number of matches by chance.
+#: This number of inliers tells a pose: matches that agree with the pose of one photo relative to
+#: another, or points that a photo sees.
+MIN_INLIERS = 15
+#: Unrelated photos can have about this number of verified matches by chance, so poses are not
+#: compared with pairs that have fewer.
 MIN_MATCHES = 50
 # Photos that follow each other were usually taken side by side, so their matches are rarely false,
 # and each match counts as `_FOLLOWING_WEIGHT` matches. In five datasets with correct poses, the
 # model confirms all 692 pairs of this kind.
-_MIN_FOLLOWING_MATCHES = 15
 _FOLLOWING_WEIGHT = 20.0
 
 
@@ -57,7 +59,7 @@ class VerifiedPair:
     @property
     def counts(self) -> bool:
         """Whether the pair has enough matches to be compared with poses."""
-        return self.matches >= (_MIN_FOLLOWING_MATCHES if self.follows else MIN_MATCHES)
+        return self.matches >= (MIN_INLIERS if self.follows else MIN_MATCHES)
 
     def other(self, photo: int) -> int:
         """The photo of this pair that is not ``photo``."""

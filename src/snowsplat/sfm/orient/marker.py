@@ -23,7 +23,7 @@ import numpy as np
 
 from snowsplat.sfm.colmap.features.sift import read_grey
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.orient.up import tangent
+from snowsplat.sfm.orient.up import CONTRADICTION, FEWEST, tangent
 from snowsplat.util.messages import Message, message, plural
 
 if TYPE_CHECKING:
@@ -40,7 +40,6 @@ _DICTIONARIES = (
     "DICT_APRILTAG_36h11",
 )
 _SIDE = 1600  # longer side of the photos in which markers are searched, pixels
-_FEWEST = 3  # photos of a marker
 # A view is wrong if its corners are farther from the square than this, in pixels of the search or
 # as a share of the marker's side in the photo, whichever is larger.
 _WRONG, _WRONG_SHARE = 2.0, 0.05
@@ -53,8 +52,7 @@ _COMMON_PIXELS, _COMMON = 0.1, 0.001
 # To find an edge: the exponent of sRGB; the pixels on each side of it that are looked at, at most,
 # at least, and as a share of the black border; and the least contrast.
 _GAMMA, _REACH, _LEAST_REACH, _BORDER, _CONTRAST = 2.2, 4.0, 1.0, 0.45, 0.02
-_AGREE = 3.0  # markers whose sides differ by more standard deviations than this disagree
-_LEAST_AGREEMENT = 0.01  # and by at least this share
+_LEAST_AGREEMENT = 0.01  # markers whose sides differ by a smaller share agree
 # Corners of a marker in units of its side, clockwise from the upper left as OpenCV returns them.
 _SQUARE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
 
@@ -125,10 +123,10 @@ def scale_of_markers(
     if not squares:
         most = max(map(len, views.values()), default=0)
         why = message("no photo shows a marker")
-        if 0 < most < _FEWEST:
+        if 0 < most < FEWEST:
             why = plural("a marker is in {n} photo only", "a marker is in {n} photos only", n=most)
         elif most:
-            why = message("no marker is a square in {n} photos", n=_FEWEST)
+            why = message("no marker is a square in {n} photos", n=FEWEST)
         return None, [
             message(
                 "the marker gives no scale: {why}; take more photos of it from near, or use "
@@ -152,7 +150,7 @@ def _combine(squares: dict[str, _Square], side: float) -> tuple[MarkerScale | No
     error = float(1 / np.sqrt((errors**-2).sum()))
     away = np.abs(np.log(sides / middle))
     doubts = []
-    if (away > np.maximum(_AGREE * np.hypot(errors, error), _LEAST_AGREEMENT)).any():
+    if (away > np.maximum(CONTRADICTION * np.hypot(errors, error), _LEAST_AGREEMENT)).any():
         ratio = 100 * (sides.max() / sides.min() - 1)
         doubts.append(
             message(
@@ -257,7 +255,7 @@ def _square(seen: list[_Seen]) -> _Square | None:
     used = np.ones(len(seen), bool)
     fitted = None
     for _ in range(len(seen)):
-        if used.sum() < _FEWEST:
+        if used.sum() < FEWEST:
             return None
         chosen = [view for view, use in zip(seen, used, strict=True) if use]
         start = _start(chosen)

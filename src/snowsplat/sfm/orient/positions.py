@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snowsplat.sfm.orient.up import Evidence
+from snowsplat.sfm.orient.up import CONTRADICTION, FEWEST, Evidence
 
 # GPS measures altitudes less accurately than horizontal positions, by this factor.
 _ALTITUDE = 2.5
@@ -21,13 +21,12 @@ _SLOPE = 0.1
 # The expected error counts as much as this number of measured errors. With few positions, the
 # measured ones are small by chance.
 _EXPECTED = 2.0
-# Positions that are farther away than this many times the error are outliers, with a small weight.
-# More than this share of outliers is a contradiction.
-_OUTLIER, _MOST_OUTLIERS = 3.0, 0.4
+# Positions that contradict the cameras are outliers, with a small weight. More than this share of
+# them says that the positions, or the poses, are wrong.
+_MOST_OUTLIERS = 0.4
 # The start of the least squares is the best of this number of fits to two positions each, measured
 # at this number of positions.
 _TRIALS, _POSITIONS = 1000, 1000
-_FEWEST = 3
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -82,7 +81,7 @@ def align(
         errors: (N,) expected standard deviations of the horizontal positions in metres.
         known: the up direction from other evidence.
     """
-    if len(np.unique(places[:, :2].round(2), axis=0)) < _FEWEST:
+    if len(np.unique(places[:, :2].round(2), axis=0)) < FEWEST:
         return None
     start = _start(centres, places, known.up)
     if start is None:
@@ -100,7 +99,7 @@ def align(
         sizes = np.stack([np.linalg.norm(away[:, :2], axis=1), np.abs(away[:, 2])], axis=1)
         sizes /= relative[:, None]
         error = _error(sizes, error, expected)
-        weights = np.minimum(1, _OUTLIER * error / np.maximum(sizes, 1e-9)) ** 2
+        weights = np.minimum(1, CONTRADICTION * error / np.maximum(sizes, 1e-9)) ** 2
         precision = _INDEPENDENT * weights / (relative[:, None] * error) ** 2
         if not has_altitudes:
             precision[:, 1] = 1 / (_SLOPE**2 * np.square(places[:, :2]).sum())
@@ -130,7 +129,7 @@ def align(
         translation + middle,
         np.linalg.inv(hessian),
         float(error[0]),
-        float((sizes[:, 0] > _OUTLIER * error[0]).mean()),
+        float((sizes[:, 0] > CONTRADICTION * error[0]).mean()),
         float(np.sqrt(up_away @ known_precision @ up_away)),
     )
 
@@ -167,7 +166,7 @@ def _start(
 def _error(sizes: np.ndarray, before: np.ndarray, expected: float) -> np.ndarray:
     """(2,) standard deviations, horizontal and vertical, of distances (N, 2) without outliers.
     ``before``: an earlier estimate, which tells the outliers."""
-    limits = _OUTLIER * np.maximum(before, np.median(sizes, axis=0))
+    limits = CONTRADICTION * np.maximum(before, np.median(sizes, axis=0))
     across, above = (size[size <= limit] for size, limit in zip(sizes.T, limits, strict=True))
     # Four unknowns are fitted to the horizontal positions, three to the altitudes.
     horizontal = (np.square(across).sum() + 2 * _EXPECTED * expected**2) / (

@@ -20,7 +20,8 @@ from snowsplat.sfm.orient.cameras import Cameras, read_cameras
 from snowsplat.sfm.orient.marker import MarkerScale
 from snowsplat.sfm.orient.positions import Alignment, align
 from snowsplat.sfm.orient.up import (
-    FEWEST_SENSORS,
+    CONTRADICTION,
+    FEWEST,
     Evidence,
     combine_evidence,
     directions_of,
@@ -45,13 +46,8 @@ _GIMBAL_YAW, _COMPASS = math.radians(3), math.radians(15)
 # Directions of sensors that differ by more than this from their median are wrong, and at most this
 # share of them may be.
 _WRONG_NORTH, _MOST_WRONG = math.radians(30), 0.25
-_FEWEST = 3
 # The level is also that of GPS if GPS makes its error smaller than this share.
 _BETTER = 0.8
-# A larger disagreement about the level, in standard deviations, is said.
-_CONTRADICTION = 3.0
-# Positions are far apart if their standard deviation is this many times their expected error.
-_FAR_APART = 3.0
 
 
 @dataclass(frozen=True)
@@ -147,7 +143,7 @@ def orientation(
         if gps is not None:
             ratio = measured.metres_per_unit / scale
             errors = math.hypot(gps.alignment.scale_error, measured.error)
-            if abs(math.log(ratio)) > _CONTRADICTION * errors:
+            if abs(math.log(ratio)) > CONTRADICTION * errors:
                 doubts.append(
                     message(
                         "by the marker, the scene is {share:.0f}% {larger} than by GPS; is its "
@@ -185,7 +181,7 @@ def _gps(
     """The GPS positions if they determine the scale, and doubts as text for users."""
     rows = [i for i, photo in enumerate(photos) if photo is not None and photo.location is not None]
     located = [photo for photo in photos if photo is not None and photo.location is not None]
-    if len(located) < _FEWEST:
+    if len(located) < FEWEST:
         return None, []
     locations = np.array([photo.location for photo in located])
     origin = middle_of(locations)
@@ -197,13 +193,13 @@ def _gps(
         ]
     spread = float(np.sqrt(np.square(places[:, :2] - places[:, :2].mean(axis=0)).sum(1).mean()))
     if alignment.scale_error > _SCALE_ERROR or not alignment.agrees:
-        if spread < _FAR_APART * float(np.median(errors)):
+        if spread < CONTRADICTION * float(np.median(errors)):
             why = message("the positions differ too little for their error")
         else:
             why = message("the positions do not agree with the camera poses")
         return None, [message("GPS gives no scale: {why}", why=why)]
     doubts = []
-    if alignment.up_away > _CONTRADICTION:
+    if alignment.up_away > CONTRADICTION:
         doubts.append(
             message(
                 "GPS positions and {others} disagree about the level", others=all_names(up.names)
@@ -222,7 +218,7 @@ def _north_of_sensors(
         (False, message("compasses"), _COMPASS),
     ):
         found = directions_of(cameras, attitudes, "north", gimbal)
-        if len(found) < FEWEST_SENSORS:
+        if len(found) < FEWEST:
             continue
         norths = np.array([_horizontal(north, up) for north in found])
         mean, spread = robust_mean(norths)

@@ -29,15 +29,15 @@ from snowsplat.util.names import all_names
 # lens exactly.
 _GIMBAL = (math.radians(2.0), math.radians(0.5))
 _ACCELEROMETER = (math.radians(3.0), math.radians(1.0))
-#: Fewer photos with a sensor may all be wrong: the accelerometer also measures the hand.
-FEWEST_SENSORS = 3
+#: Of fewer measurements, a wrong one cannot be told from the right ones.
+FEWEST = 3
 # Standard deviation of the slope of what a marker lies on, and the largest angle to level at which
 # it may lie flat.
 _PAPER, _LYING = math.radians(1.5), math.radians(20)
 # Sensors whose directions differ by more than this from their median are in contradiction.
 _LARGEST_SPREAD = math.radians(10)
-# Evidence that differs from the more accurate evidence by more standard deviations is not used.
-_CONTRADICTION = 3.0
+#: Measurements that differ by more standard deviations contradict each other.
+CONTRADICTION = 3.0
 # Smaller contradictions are not said: people also tilt a camera, and ground slopes.
 _SAID = math.radians(20)
 # Evidence with a smaller share of the precision in all directions is not named.
@@ -93,7 +93,7 @@ def of_sensors(
         (False, message("accelerometers")),
     ):
         ups = directions_of(cameras, attitudes, "up", gimbal)
-        if len(ups) < FEWEST_SENSORS:
+        if len(ups) < FEWEST:
             continue
         mean, spread = robust_mean(ups)
         if spread > _LARGEST_SPREAD:
@@ -195,7 +195,7 @@ def with_markers(
         mean, spread = robust_mean(normals[flat])
         error = math.hypot(max(spread, float(np.median(errors[flat]))), _PAPER)
         markers = Evidence((name,), mean, isotropic(mean, error))
-        if _apart(known, markers) < _CONTRADICTION:
+        if _apart(known, markers) < CONTRADICTION:
             return _mean(known, markers), []
     return known, [
         plural(
@@ -232,7 +232,7 @@ def combine_evidence(evidence: Sequence[Evidence]) -> tuple[Evidence, list[Messa
     best, doubts = evidence[0], []
     for other in evidence[1:]:
         angle = math.acos(min(1.0, max(-1.0, float(best.up @ other.up))))
-        if _apart(best, other) < _CONTRADICTION:
+        if _apart(best, other) < CONTRADICTION:
             best = _mean(best, other)
         elif angle > _SAID:
             doubts.append(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from snowsplat.sfm.colmap.database import (
+    MIN_MATCHES,
     VerifiedPair,
     displacement_of,
     feature_counts,
@@ -17,8 +18,6 @@ from snowsplat.util.messages import Message, message, plural
 
 # A photo with fewer features is too dark, blurred or plain.
 _FEW_FEATURES = 60
-# A pair of photos with fewer verified matches is too weak to estimate a pose from it.
-_WEAK_PAIR = 50
 # Nearly every sharp photo has more features than this.
 _MANY_FEATURES = 500
 # If the displacement of the matches, divided by the longest side of the photo, is smaller, the
@@ -118,7 +117,7 @@ def explain(
             )
         elif not matches:
             reason = message("it matches no other photo")
-        elif max(matches) < _WEAK_PAIR:
+        elif max(matches) < MIN_MATCHES:
             reason = message(
                 "it has too few matches with {others} (at most {most})",
                 others=others,

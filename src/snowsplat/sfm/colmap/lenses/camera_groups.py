@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pycolmap
 
-from snowsplat.sfm.colmap.lenses.lens import camera_ids, robust_adjustment, used_cameras
+from snowsplat.sfm.colmap.lenses.lens import TOLERANCE, camera_ids, robust_adjustment, used_cameras
 from snowsplat.sfm.ingest.photo import Photo
 
 # Focal lengths of two groups differ by at least this factor. Smaller differences have little effect
@@ -65,7 +65,7 @@ def own_focals(model: pycolmap.Reconstruction, threads: int) -> dict[int, float]
     part = _with_separate_cameras(model)
     part.update_point_3d_errors()
     before = part.compute_mean_reprojection_error()
-    options = robust_adjustment(threads, 1e-4, before)
+    options = robust_adjustment(threads, TOLERANCE, before)
     # With a distortion for each photo, the focal lengths are less well determined.
     options.refine_extra_params = False
     pycolmap.bundle_adjustment(part, options)

@@ -58,6 +58,8 @@ _MAX_MOUSTACHE = 0.02
 _EQUAL_ERROR = 0.05
 # A possible lens is used instead of an impossible one up to this factor between the errors.
 _MAX_WORSE = 2.0
+#: Bundle adjustment ends when an iteration reduces the cost by less than this share.
+TOLERANCE = 1e-4
 # The estimated focal length is in doubt if it differs from that in EXIF by more than this share.
 _NEAR_EXIF = 0.1
 _FOLDED = message("the lens distortion is not one-to-one over the whole photo")

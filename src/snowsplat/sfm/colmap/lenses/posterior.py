@@ -24,7 +24,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import pycolmap
 
-from snowsplat.sfm.colmap.lenses.lens import robust_adjustment, used_cameras
+from snowsplat.sfm.colmap.lenses.lens import TOLERANCE, robust_adjustment, used_cameras
 from snowsplat.sfm.colmap.lenses.prior import Floats, Term, log_prior, parameters, terms
 
 #: Standard deviation of the error of a parameter, divided by the formal one. Measured: 3 to 9 from
@@ -35,7 +35,6 @@ OVERDISPERSION = 10.0
 # 1 s. More photos determine more, so it is too large rather than too small.
 _MOST_PHOTOS = 200
 _PHOTOS_OF_CAMERA = 2  # least mean number
-_TOLERANCE = 1e-4  # of bundle adjustment, as in `robust_adjustment`
 
 
 def estimate_lenses(
@@ -114,7 +113,7 @@ def _adjuster(
     for image_id in images:
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    options = robust_adjustment(threads, _TOLERANCE, scale)
+    options = robust_adjustment(threads, TOLERANCE, scale)
     options.refine_focal_length = free
     options.refine_principal_point = free
     options.refine_extra_params = free

@@ -9,6 +9,7 @@ from pathlib import Path
 import pycolmap
 
 from snowsplat.sfm.colmap.database import (
+    MIN_INLIERS,
     closing_database,
     copy_for_mapping,
     keep_matches_of_long_tracks,
@@ -16,7 +17,7 @@ from snowsplat.sfm.colmap.database import (
 )
 from snowsplat.sfm.colmap.features.alignment import align_features
 from snowsplat.sfm.colmap.features.extraction import SEED
-from snowsplat.sfm.colmap.lenses.lens import robust_adjustment
+from snowsplat.sfm.colmap.lenses.lens import TOLERANCE, robust_adjustment
 from snowsplat.sfm.colmap.lenses.posterior import estimate_lenses
 from snowsplat.sfm.colmap.mapping.incremental import IncrementalMapper
 from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph, spread_subset
@@ -25,9 +26,8 @@ from snowsplat.sfm.options import MIN_PHOTOS, Mapper
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import new_entries, new_folder
 
-# A camera that sees fewer points has no reliable pose. The alignment of features reduces their
-# errors to a third; then fewer points are sufficient.
-MIN_POINTS = 15
+# The alignment of features reduces their errors to a third; then fewer points than `MIN_INLIERS`
+# tell a pose.
 _MIN_POINTS_ALIGNED = 10
 # At the end, observations with a larger reprojection error are removed. In pixels of the resized
 # photo in which the features were detected.
@@ -47,9 +47,8 @@ _ITERATIONS = 20
 # before the last scale of its loss and with it. The alignment of features moves cameras by little,
 # so larger shares suffice after it: the centres are the same within 0.005% of the extent. By
 # default, COLMAP goes on until the gradient is small, which takes several times as long.
-_LOCAL_TOLERANCE = 1e-4
 _GLOBAL_TOLERANCE = 1e-5
-_EARLY_TOLERANCE, _FINAL_TOLERANCE = 1e-3, 1e-4
+_EARLY_TOLERANCE = 1e-3
 _ALIGNED_TOLERANCES = (1e-2, 1e-3)
 # The bundle adjustment of the result has a Cauchy loss, so false matches that became observations
 # have little effect on the poses. Its scale, in units of the mean reprojection error, is decreased:
@@ -175,7 +174,7 @@ class Mapping:
             options.ba_global_max_refinements = 1
             options.ba_global_max_num_iterations = _ITERATIONS
         options.ba_global_function_tolerance = _GLOBAL_TOLERANCE
-        options.ba_local_function_tolerance = _LOCAL_TOLERANCE
+        options.ba_local_function_tolerance = TOLERANCE
         options.ba_local_max_refinements = 1
         options.random_seed = SEED
         mapper, triangulation = options.mapper, options.triangulation
@@ -193,7 +192,7 @@ class Mapping:
             options.min_num_matches = 10
             mapper.init_min_num_inliers = 40
             mapper.init_min_tri_angle = 6.0
-            mapper.abs_pose_min_num_inliers = 15
+            mapper.abs_pose_min_num_inliers = MIN_INLIERS
             mapper.abs_pose_min_inlier_ratio = 0.15
             mapper.max_reg_trials = 6
         return options
@@ -287,9 +286,9 @@ class Mapping:
     def _refine(
         self,
         model: pycolmap.Reconstruction,
-        min_points: int = MIN_POINTS,
+        min_points: int = MIN_INLIERS,
         scales: Sequence[float] = _FINAL_LOSS_SCALES,
-        tolerances: tuple[float, float] = (_EARLY_TOLERANCE, _FINAL_TOLERANCE),
+        tolerances: tuple[float, float] = (_EARLY_TOLERANCE, TOLERANCE),
     ) -> pycolmap.Reconstruction:
         """Remove outliers and run bundle adjustment, for each of ``scales`` of the loss. Changes
         ``model`` and returns it. ``min_points`` as in `_remove_outliers`;
@@ -304,7 +303,7 @@ class Mapping:
         return model
 
     def _adjust(
-        self, model: pycolmap.Reconstruction, scale: float, tolerance: float = _FINAL_TOLERANCE
+        self, model: pycolmap.Reconstruction, scale: float, tolerance: float = TOLERANCE
     ) -> None:
         """Run bundle adjustment; ``scale`` of the loss, in units of the mean reprojection error."""
         scale *= model.compute_mean_reprojection_error()

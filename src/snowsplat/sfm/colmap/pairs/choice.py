@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap.database import VerifiedPair
+from snowsplat.sfm.colmap.database import MIN_MATCHES, VerifiedPair
 from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.gps import east_north_up, middle_of, position_errors
 from snowsplat.sfm.ingest.photo import Photo
@@ -53,9 +53,8 @@ _NUMBERED_NAME = re.compile(r"(.*?)([0-9]+)\.[^./]*")
 # Of the similar photos of a photo, this number of the most similar ones is matched first, and then
 # those whose place in the order grows by this factor.
 _MOST_SIMILAR, _STEP = 6, 1.25
-# A pair with at least this number of verified matches connects two photos well. A photo with at
-# least this number of such pairs needs no reserve.
-_CLEAR_MATCHES, _CLEAR_PAIRS = 50, 8
+# A photo with at least this number of pairs that have `MIN_MATCHES` needs no reserve.
+_CLEAR_PAIRS = 8
 
 WORDS = 64  # number of visual words
 # Number of features of a photo that are used. The largest ones are used, because they are also
@@ -96,7 +95,7 @@ class PairChoice:
             verified: the pairs with verified matches.
             count: number of photos.
         """
-        clear = [(p.first - 1, p.second - 1) for p in verified if p.matches >= _CLEAR_MATCHES]
+        clear = [(p.first - 1, p.second - 1) for p in verified if p.matches >= MIN_MATCHES]
         first, second = np.array(clear, np.int64).reshape(-1, 2).T
         partners = np.bincount(np.concatenate([first, second]), minlength=count)
         groups = np.unique(components((first, second), count)[partners > 0])

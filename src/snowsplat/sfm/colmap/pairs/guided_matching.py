@@ -32,7 +32,8 @@ _SHARE = 1 / 3  # of the features, which are matched first
 # The epipolar lines are known if at least this number of the first matches, and this share of them,
 # agrees with a fundamental matrix.
 _LEAST, _AGREEING, _CONFIDENCE = 40, 0.7, 0.99
-_SAMPLE = 300  # of these matches; more of them take more time
+#: Matches with which a model is estimated, before all are compared with it; more take more time.
+SAMPLE = 300
 # At least this number of these matches must not agree with a homography. The points of a plane do
 # not determine the lines.
 _OFF_PLANE = 20
@@ -125,7 +126,7 @@ def _epipolar_lines(
     options.max_error, options.random_seed = max_error, SEED
     options.min_inlier_ratio, options.min_num_trials = _AGREEING, 0
     options.confidence, options.dyn_num_trials_multiplier = _CONFIDENCE, 1.0
-    some = matches[np.linspace(0, len(matches) - 1, min(_SAMPLE, len(matches))).astype(int)]
+    some = matches[np.linspace(0, len(matches) - 1, min(SAMPLE, len(matches))).astype(int)]
     pixels = first.positions[some[:, 0]], second.positions[some[:, 1]]
     found = pycolmap.estimate_fundamental_matrix(*pixels, options)
     if found is None or found["num_inliers"] < max(_LEAST, _AGREEING * len(some)):

@@ -11,9 +11,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.scene.epipolar import sampson_distances
-from snowsplat.sfm.colmap.database import closing_database
+from snowsplat.sfm.colmap.database import MIN_INLIERS, closing_database
 from snowsplat.sfm.colmap.features.extraction import SEED, WorkerProgress
-from snowsplat.sfm.colmap.pairs.guided_matching import PhotoSide, match
+from snowsplat.sfm.colmap.pairs.guided_matching import SAMPLE, PhotoSide, match
 from snowsplat.sfm.colmap.pairs.matching import LENGTH
 from snowsplat.util import native_library
 
@@ -25,9 +25,7 @@ _PAIRS_PER_BLOCK = 64
 # Number of photos whose descriptors are kept in memory while pairs are matched.
 _CACHED_PHOTOS = 100
 
-# A verified pair has at least this many inliers: matches that are consistent with a relative pose.
-_MIN_INLIERS = 15
-# RANSAC looks for at least one of these shares of inliers, the smallest with `_MIN_INLIERS` of the
+# RANSAC looks for at least one of these shares of inliers, the smallest with `MIN_INLIERS` of the
 # matches of a pair. The last one is the default of COLMAP; it is used for pairs with many matches.
 _INLIER_RATIOS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.32, 0.25)
 # The maximum number of samples of RANSAC (COLMAP: 10,000). It matters for pairs with many
@@ -38,8 +36,6 @@ _MAX_TRIALS = 3000
 _FEW = 100
 # If more than this share of the matches agrees with one model, no other one is tried.
 _MOST = 0.5
-# A model of all matches is estimated with this number of them; then all are compared with it.
-_SAMPLE = 300
 # The kind of a pair is found among matches that agree with one model already: at least this share
 # of them agrees with the right kind of model, and this number of them is enough.
 _AGREEING, _ENOUGH, _FEWEST_TRIALS = 0.75, 200, 30
@@ -164,7 +160,7 @@ def verify_matches(
     """
     (one, points), (other, others) = first, second
     options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers = _MIN_INLIERS
+    options.min_num_inliers = MIN_INLIERS
     ransac = options.ransac
     ransac.max_num_trials, ransac.max_error, ransac.random_seed = _MAX_TRIALS, max_error, SEED
     ransac.min_inlier_ratio = _inlier_ratio(len(matches))
@@ -176,11 +172,11 @@ def verify_matches(
         matrix, agreeing = _consensus(*pixels, (one, other) if calibrated else None, ransac)
         matches = matches[agreeing]
         ransac.min_inlier_ratio, ransac.min_num_trials = _AGREEING, _FEWEST_TRIALS
-        if len(matches) >= _MIN_INLIERS:
+        if len(matches) >= MIN_INLIERS:
             found = _from_a_part(first, second, matches, None if calibrated else matrix, options)
     if found is not None:
         return found
-    if len(matches) < _MIN_INLIERS:
+    if len(matches) < MIN_INLIERS:
         return pycolmap.TwoViewGeometry()
     return pycolmap.estimate_two_view_geometry(one, points, other, others, matches, options)
 
@@ -231,10 +227,10 @@ def _from_a_part(
 def _inlier_ratio(matches: int) -> float:
     """The smallest share of inliers that RANSAC has to find among this number of matches.
 
-    The number of samples in RANSAC depends on it. A pair with few matches and `_MIN_INLIERS`
+    The number of samples in RANSAC depends on it. A pair with few matches and `MIN_INLIERS`
     inliers has a high share, so a few samples suffice to find the inliers or to reject the pair.
     """
-    least = _MIN_INLIERS / max(1, matches)
+    least = MIN_INLIERS / max(1, matches)
     return next((ratio for ratio in _INLIER_RATIOS if ratio <= least), _INLIER_RATIOS[-1])
 
 
@@ -252,7 +248,7 @@ def _consensus(
     Returns:
         (3, 3) the fundamental matrix, None if another kind of model is better, and (M,) the set.
     """
-    some = np.linspace(0, len(first) - 1, min(_SAMPLE, len(first))).astype(int)
+    some = np.linspace(0, len(first) - 1, min(SAMPLE, len(first))).astype(int)
     found = pycolmap.estimate_fundamental_matrix(first[some], second[some], options)
     if found is not None and found["num_inliers"] > _MOST * len(some):
         return found["F"], sampson_distances(found["F"], first, second) <= options.max_error

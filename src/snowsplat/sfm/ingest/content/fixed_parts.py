@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.sfm.ingest.content.image_circle import find_image_circle
-from snowsplat.sfm.ingest.content.still_background import Backdrop, find_backdrop
+from snowsplat.sfm.ingest.content.image_circle import BLACK, find_image_circle
+from snowsplat.sfm.ingest.content.still_background import SAME_LEVEL, Backdrop, find_backdrop
 from snowsplat.util.messages import Message, message
 
 #: Longest side in pixels of the copies.
@@ -34,13 +34,11 @@ MIN_PHOTOS = 6
 ENOUGH_PHOTOS = 32
 
 _LEAST_SIDE = 32  # pixels of a copy
-_SAME_LEVEL = 6.0  # grey levels; compression changes a constant pixel by less
 # Share of the pixels of a row (or column) that are constant: in a bar at least the first, beside it
 # at most the second. A bar may contain a clock, and the scene beside it may be white in places.
 _BAR, _BESIDE = 0.8, 0.4
 _BAR_EDGE = 4  # pixels: width of the blurred edge of a bar
-_BLACK = 40.0  # grey levels; a bright bar without an opposite one may be a white sky or a wall
-_TEXT_IN_BAR = 0.003  # share of the pixels of a bar that differ by `_BLACK` from the others
+_TEXT_IN_BAR = 0.003  # share of the pixels of a bar that differ by `BLACK` from the others
 _SYMMETRIC = 0.02  # opposite bars that differ by less, as a fraction of the side, are equal
 
 _FINE, _COARSE = 1.0, 3.0  # pixels: standard deviations of the band-pass filter. Shading is coarser
@@ -167,7 +165,7 @@ def _inner(shape: tuple[int, ...], bars: tuple[int, int, int, int]) -> tuple[sli
 def _bars(copies: NDArray[np.uint8]) -> tuple[int, int, int, int]:
     """Widths in pixels of the bars at the left, top, right and bottom, with their blurred edges."""
     low, high = np.quantile(copies, [0.03, 0.97], axis=0)
-    constant = high - low <= _SAME_LEVEL
+    constant = high - low <= SAME_LEVEL
     if constant.mean(axis=0).min() >= _BAR or constant.mean(axis=1).min() >= _BAR:
         return 0, 0, 0, 0  # all of it
     columns, rows = constant.mean(axis=0) < _BAR, constant.mean(axis=1) < _BAR
@@ -202,8 +200,8 @@ def _is_no_scene(levels: NDArray[np.floating], constant: NDArray[np.bool_]) -> b
     if not levels.size:
         return False
     middle = float(np.median(levels))
-    text = constant & (np.abs(levels - middle) > _BLACK)
-    return middle <= _BLACK or bool(text.mean() >= _TEXT_IN_BAR)
+    text = constant & (np.abs(levels - middle) > BLACK)
+    return middle <= BLACK or bool(text.mean() >= _TEXT_IN_BAR)
 
 
 # Edges

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 _DIRECTIONS = 180  # from the centre of the frame, in which the edge of the disc is searched
 _CORNER = 0.04  # side of the corners of the frame that are compared, relative to its shorter side
-# Grey levels. Stray light makes the outside of the disc brighter than black.
-_BLACK, _CONTRAST = 40.0, 40.0
+#: Grey levels: stray light makes black brighter than 0.
+BLACK = 40.0
 # Brightness between the outside (0) and the middle of the disc (1). A pixel is lit above the first
 # one. Just inside of the edge, the disc is brighter than the second one: vignetting is gradual.
 _LIT, _AT_EDGE = 0.15, 0.4
@@ -46,13 +46,13 @@ def find_image_circle(copies: NDArray[np.uint8]) -> ImageCircle | None:
     side = max(2, round(_CORNER * min(height, width)))
     ends = slice(None, side), slice(-side, None)
     corners = np.stack([copies[:, rows, columns] for rows in ends for columns in ends])
-    if np.quantile(corners, 0.97, axis=(1, 2, 3)).max() > _BLACK:  # fast for most photos
+    if np.quantile(corners, 0.97, axis=(1, 2, 3)).max() > BLACK:  # fast for most photos
         return None
     brightest = np.quantile(copies, 0.97, axis=0)
     outside = float(np.median(np.quantile(corners, 0.97, axis=1)))
     middle = brightest[height // 4 : -height // 4, width // 4 : -width // 4]
     contrast = float(np.median(middle)) - outside
-    if contrast < _CONTRAST:
+    if contrast < BLACK:
         return None
     level = (brightest - outside) / contrast
     edge = _edge(level > _LIT)

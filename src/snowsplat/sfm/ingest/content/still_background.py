@@ -15,7 +15,7 @@ _BLOCK = 16  # pixels: side of the blocks in which the edges are counted
 # Of the blocks with edges, at least the first share shows edges that stand still, and at least the
 # second share an object without such edges. A tripod without a turntable has no second share.
 _STILL, _OBJECT = 0.3, 0.03
-_SAME_LEVEL = 6.0  # grey levels; compression and noise change a pixel by less
+SAME_LEVEL = 6.0  # grey levels; compression and noise change a pixel by less
 _NOISE = 3.0  # changes of less than this multiple of the noise are no changes
 _PATCH = np.ones((5, 5), np.uint8)  # what has to be the same as in another photo, around a pixel
 _TEXTURED = 0.3  # share of the pixels of a part of the backdrop with texture
@@ -84,7 +84,7 @@ def find_backdrop(
         return None
     low, high = copies.min(axis=0).astype(np.float32), copies.max(axis=0).astype(np.float32)
     changes = high - low
-    tolerance = max(_SAME_LEVEL, _NOISE * float(np.median(changes[inner][fixed])))
+    tolerance = max(SAME_LEVEL, _NOISE * float(np.median(changes[inner][fixed])))
     changed = np.zeros(changes.shape, np.uint8)
     changed[inner] = changes[inner] > tolerance
     changed = cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
