@@ -120,11 +120,10 @@ def align_patches(patches: NDArray[np.uint8], pairs: NDArray[np.int32]) -> Align
     return aligned
 
 
-# A feature is moved to its aligned position if all of these conditions hold. Otherwise it is not
-# moved: if its match is false, the robust loss of the bundle adjustment reduces its effect.
+# A feature is moved to its aligned position if both conditions hold. Otherwise it is not moved: if
+# its match is false, the robust loss of the bundle adjustment reduces its effect.
 _MIN_CORRELATION = 0.8
 _MAX_SHIFT = 3.0  # pixels of the patch
-_MAX_STRETCH = 10.0  # of the area of the window, and of its inverse
 # Number of features whose patches are in memory; each has 729 bytes. A photo is read again in each
 # block that has features of it.
 _BLOCK = 200_000
@@ -230,15 +229,10 @@ class _Patches(NamedTuple):
         pairs = np.stack([template[others], others], 1).astype(np.int32)
         transform, correlation = align_patches(self.patches, pairs)
         shift = transform[:, :, 2]
-        area = np.linalg.det(transform[:, :, :2])
         positions, good = self.positions.copy(), np.ones(len(template), bool)
         positions[others] += (self.axes[others] @ shift[:, :, None])[:, :, 0]
-        good[others] = (
-            (correlation >= _MIN_CORRELATION)
-            & (np.linalg.norm(shift, axis=1) <= _MAX_SHIFT)
-            & (area >= 1 / _MAX_STRETCH)
-            & (area <= _MAX_STRETCH)
-        )
+        is_near = np.linalg.norm(shift, axis=1) <= _MAX_SHIFT
+        good[others] = (correlation >= _MIN_CORRELATION) & is_near
         return positions, good
 
     def _templates(self, features: _Features) -> NDArray[np.int64]:

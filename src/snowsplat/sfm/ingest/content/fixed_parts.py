@@ -59,7 +59,6 @@ _SUDDEN = 0.4
 _SUDDEN_IN_MIDDLE = 0.8
 _NEAR_BORDER = 0.15  # distance, as a fraction of the height or the width
 _AROUND = 8  # pixels: edges at most this far from a fixed edge are around it
-_MIN_EDGES = 40  # pixels of fixed edges in an overlay
 _GAP = 12  # pixels: gap between two words of a text
 _BLUR = np.ones((9, 9), np.uint8)  # what is masked around a fixed edge: its blur is fixed, too
 _TEXT_HEIGHT = 0.12  # of the height of the frame; higher overlays are no line of text
@@ -72,8 +71,8 @@ _CHANGING_DIGITS = 1.5
 _DIRECTIONS = 0.02
 _ALL_OF_IT = 0.5  # share of the picture; if more does not move, it is the camera that stands still
 # A part of the frame that an overlay encloses is masked, too, if its pixels change less than this
-# fraction of the scene's, or if it is smaller than this fraction of the frame.
-_CALM, _SMALL = 0.5, 0.02
+# fraction of the scene's.
+_CALM = 0.5
 
 #: Left, top, right and bottom of a part of a picture, as fractions of its width and height.
 Crop = tuple[float, float, float, float]
@@ -265,8 +264,6 @@ def _overlays(edges: _Edges, copies: NDArray[np.uint8]) -> NDArray[np.bool_]:
 def _is_overlay(part: NDArray[np.bool_], box: tuple[int, int, int, int], edges: _Edges) -> bool:
     """Whether a connected ``part`` (H, W) of the fixed edges is no part of the scene. ``box``:
     left, top, width and height of the part."""
-    if (edges.fixed & part).sum() < _MIN_EDGES:
-        return False
     rows, columns = part.shape
     x, y, width, height = box
     gradients = np.stack([edges.x[edges.fixed & part], edges.y[edges.fixed & part]])
@@ -288,12 +285,11 @@ def _with_enclosed(found: NDArray[np.bool_], copies: NDArray[np.uint8]) -> NDArr
     if number <= 2:
         return found
     changes = copies.astype(np.float32).std(axis=0)
-    areas = boxes[1:, cv2.CC_STAT_AREA]
-    scene = 1 + int(areas.argmax())
+    scene = 1 + int(boxes[1:, cv2.CC_STAT_AREA].argmax())
     calm = _CALM * float(np.median(changes[labels == scene]))
     for i in set(range(1, number)) - {scene}:
         part = labels == i
-        if areas[i - 1] <= _SMALL * found.size or float(np.median(changes[part])) <= calm:
+        if float(np.median(changes[part])) <= calm:
             found = found | part
     return found
 
