@@ -151,7 +151,6 @@ def measure(work: Workload, folder: Path, options: Mapping[str, Any], source: Pa
         "wall": sum(times["wall"] for times in answer["stages"].values()),
         "cpu": sum(times["cpu"] for times in answer["stages"].values()),
         "peak_mb": answer["peak_mb"],
-        "own_peak_mb": answer["own_peak_mb"],
     }
     if result is not None:
         row |= {

@@ -11,6 +11,9 @@
     turns    a street; the camera walks ahead and turns from side to side
     fisheye  the photos of "room" at the same places, with a fisheye lens of 150°
     panorama the room; 360° panoramas on the loops of "room", of twice the width
+    brackets the still life, three exposures at each place
+    devices  the photos of "around", of three cameras with other sizes and distortions
+    zoom     as "around", with a zoom of 1 to 2 in the middle third; a video, as EXIF has one zoom
 
 Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
 the seed.
@@ -21,6 +24,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +42,7 @@ from sfm_paths import (
     through_two_rooms,
     to_the_side,
 )
+from sfm_shots import GAINS, Shoot, brackets, devices, zoom
 from torch import Tensor
 
 from snowsplat.sfm.progress import Report, silent
@@ -79,6 +84,8 @@ class Kind:
     build: Callable[[int, int], Scene]  # arguments: the seed, the number of photos
     path: Callable[[int, int], list[Tensor]]  # arguments: the number of photos, the seed
     lens: Callable[[int, int], CentredLens] = phone_lens  # arguments: width, height
+    # How each photo is taken, if they differ. Arguments: the lens, the poses.
+    shoot: Callable[[CentredLens, Sequence[Tensor]], Shoot] | None = None
 
 
 def cache_folder() -> Path:
@@ -104,9 +111,9 @@ def photos_of(
     """
     chosen = KINDS[kind]
     folder = cache / f"{kind}-{count}-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
-    lens = chosen.lens(*size)
-    poses = chosen.path(count, seed)
-    return folder, take_photos(folder, lambda: chosen.build(seed, count), lens, poses, seed, report)
+    lens, poses = chosen.lens(*size), chosen.path(count, seed)
+    build, shoot = partial(chosen.build, seed, count), chosen.shoot and chosen.shoot(lens, poses)
+    return folder, take_photos(folder, build, lens, poses, seed, report, shoot)
 
 
 def video_of(
@@ -126,9 +133,8 @@ def video_of(
     folder = cache / f"{kind}-{seconds}s-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
     poses = in_between(chosen.path(seconds, seed), seconds * FRAMES_PER_SECOND)
     lens = chosen.lens(*size)
-    truth = take_photos(
-        folder / "frames", lambda: chosen.build(seed, seconds), lens, poses, seed, report
-    )
+    build, shoot = partial(chosen.build, seed, seconds), chosen.shoot and chosen.shoot(lens, poses)
+    truth = take_photos(folder / "frames", build, lens, poses, seed, report, shoot)
     video = folder / "video.mp4"
     if not video.exists():
         with video_writer(video, lens.width, lens.height, FRAMES_PER_SECOND) as add:
@@ -418,4 +424,11 @@ KINDS = {
     "fisheye": Kind(
         _indoors(_room), loops, lambda width, height: fisheye_lens(width, height, 150.0)
     ),
+    "brackets": Kind(
+        _indoors(still_life),
+        lambda count, seed: [pose for pose in walk(-(-count // 3), seed) for _ in GAINS][:count],
+        shoot=brackets,
+    ),
+    "devices": Kind(_indoors(still_life), walk, shoot=devices),
+    "zoom": Kind(_indoors(still_life), walk, shoot=zoom),
 }

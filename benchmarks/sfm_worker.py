@@ -2,9 +2,8 @@
 
 The job is one line of JSON on standard input: "inputs", "folder" and "options", which are fields of
 `SfmOptions`. The response is one line of JSON on standard output: "stages", "peak_mb" (of COLMAP's
-process), "own_peak_mb" (of this process), and "result" or "error". "stages" has the wall time and
-the processor time of each stage in seconds; processor time includes all threads and child
-processes.
+process), and "result" or "error". "stages" has the wall time and the processor time of each stage
+in seconds; processor time includes all threads and child processes.
 
 Only `make_dataset` and its progress are used, so the process can run other builds of the package.
 """
@@ -26,14 +25,10 @@ _TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 _SAMPLE_SECONDS = 0.05
 _STAGES = {"photos": "decode", "images": "undistort", "report": "report"}
 # The items that the progress of the stage "poses" counts -> the name of the part in the tables.
-# Includes the names that earlier builds use for these items (`--versus`).
 _COUNTED = {
     "photos with features": "features",
-    "features": "features",
     "matched pairs": "match",
-    "compared pairs": "match",
     "verified pairs": "match",
-    "pairs": "match",
     "registered photos": "map",
 }
 _BEFORE = "start"  # the time until the first progress of a stage, mainly to start COLMAP's process
@@ -162,7 +157,6 @@ def main() -> None:
         answer["error"] = str(error)
         watch.end("", None)
     answer |= {"stages": watch.stages, "peak_mb": watch.memory.peak}
-    answer["own_peak_mb"] = _peak_mb("self")
     print(json.dumps(answer), flush=True)
 
 
