@@ -34,7 +34,7 @@ _INLIER_RATIOS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.32, 0.25)
 _MAX_TRIALS = 3000
 # Pairs with fewer matches are verified in one step: none of their matches can be spared.
 _FEW = 100
-# If more than this share of the matches agrees with one model, no other one is tried.
+# If more than this share of a sample of the matches agrees with a model, it is that of all.
 _MOST = 0.5
 # The kind of a pair is found among matches that agree with one model already: at least this share
 # of them agrees with the right kind of model, and this number of them is enough.
@@ -168,8 +168,7 @@ def verify_matches(
     found = None
     if len(matches) >= _FEW and pinholes:
         calibrated = one.has_prior_focal_length and other.has_prior_focal_length
-        pixels = points[matches[:, 0]], others[matches[:, 1]]
-        matrix, agreeing = _consensus(*pixels, (one, other) if calibrated else None, ransac)
+        matrix, agreeing = _consensus(points[matches[:, 0]], others[matches[:, 1]], ransac)
         matches = matches[agreeing]
         ransac.min_inlier_ratio, ransac.min_num_trials = _AGREEING, _FEWEST_TRIALS
         if len(matches) >= MIN_INLIERS:
@@ -235,36 +234,17 @@ def _inlier_ratio(matches: int) -> float:
 
 
 def _consensus(
-    first: _Floats,
-    second: _Floats,
-    lenses: tuple[pycolmap.Camera, pycolmap.Camera] | None,
-    options: pycolmap.RANSACOptions,
+    first: _Floats, second: _Floats, options: pycolmap.RANSACOptions
 ) -> tuple[_Floats | None, NDArray[np.bool_]]:
-    """The largest set of matches that agrees with one model; ``first``, ``second`` (M, 2).
+    """The fundamental matrix (3, 3) with which the most matches agree, and (M,) which ones do.
 
-    A homography, and an essential matrix if the ``lenses`` are known, are tried if only a small
-    share agrees with a fundamental matrix: they need fewer matches in a sample.
-
-    Returns:
-        (3, 3) the fundamental matrix, None if another kind of model is better, and (M,) the set.
+    ``first``, ``second``: (M, 2). None: no matrix was found.
     """
     some = np.linspace(0, len(first) - 1, min(SAMPLE, len(first))).astype(int)
     found = pycolmap.estimate_fundamental_matrix(first[some], second[some], options)
     if found is not None and found["num_inliers"] > _MOST * len(some):
         return found["F"], sampson_distances(found["F"], first, second) <= options.max_error
-    estimates: list[Callable[[], dict[str, Any] | None]] = [
-        lambda: pycolmap.estimate_fundamental_matrix(first, second, options),
-        lambda: pycolmap.estimate_homography_matrix(first, second, options),
-    ]
-    if lenses is not None:
-        estimates.append(
-            lambda: pycolmap.estimate_essential_matrix(first, second, *lenses, options)
-        )
-    matrix, best = None, np.zeros(len(first), bool)
-    for estimate in estimates:
-        found = estimate()
-        if found is not None and found["num_inliers"] > best.sum():
-            matrix, best = found.get("F"), np.asarray(found["inlier_mask"], bool)
-        if best.mean() > _MOST:
-            break
-    return matrix, best
+    found = pycolmap.estimate_fundamental_matrix(first, second, options)
+    if found is None:
+        return None, np.zeros(len(first), bool)
+    return found["F"], np.asarray(found["inlier_mask"], bool)
