@@ -18,6 +18,7 @@ from .scenes import (
     NATIVE_FLOAT32,
     NATIVE_FLOAT64,
     REFERENCE,
+    WEBGPU_FLOAT32,
     Variant,
 )
 
@@ -34,7 +35,7 @@ def _one_torch_thread() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def _isa_is_marked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fails if a test runs CPU kernels without the mark `isa`."""
-    exempt = {"isa", "emulated", "gpu"}.intersection(
+    exempt = {"isa", "emulated", "gpu", "webgpu"}.intersection(
         mark.name for mark in request.node.iter_markers()
     )
     if exempt or "recorder" in request.fixturenames:  # the recorder is not a kernel
@@ -48,13 +49,14 @@ def _isa_is_marked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """With SNOWSPLAT_CASES=few, of the cases of a test only so many that each value of each
-    parameter occurs: for runs that repeat the tests (see the Makefile).
+    parameter occurs: for runs that repeat the tests (see the Makefile). Always for webgpu, whose
+    adapter may be a driver that computes on the CPU.
     """
-    if os.environ.get("SNOWSPLAT_CASES") != "few":
-        return
+    few = os.environ.get("SNOWSPLAT_CASES") == "few"
     cases: dict[object, list[pytest.Function]] = {}
     for item in items:
-        if isinstance(item, pytest.Function) and hasattr(item, "callspec"):
+        is_counted = few or item.get_closest_marker("webgpu") is not None
+        if is_counted and isinstance(item, pytest.Function) and hasattr(item, "callspec"):
             engines = tuple(v for v in item.callspec.params.values() if isinstance(v, Variant))
             cases.setdefault((item.path, item.originalname, engines), []).append(item)
     superfluous: set[pytest.Item] = set()
@@ -76,7 +78,12 @@ def variants(*among: Variant) -> list:
     reference and the kernels of a GPU would only repeat the same check. Tests that need a GPU exist
     only where there is one.
     """
-    marks = {"native": pytest.mark.isa, "cuda": pytest.mark.gpu, "emulated": pytest.mark.emulated}
+    marks = {
+        "native": pytest.mark.isa,
+        "cuda": pytest.mark.gpu,
+        "emulated": pytest.mark.emulated,
+        "webgpu": pytest.mark.webgpu,
+    }
     return [
         pytest.param(v, id=str(v), marks=[marks[v.engine]] if v.engine in marks else [])
         for v in among
@@ -87,13 +94,13 @@ def variants(*among: Variant) -> list:
 #: Finite differences of the reference take a second or two.
 SLOW_REFERENCE = pytest.param(REFERENCE, id=str(REFERENCE), marks=pytest.mark.slow)
 FLOAT64 = (NATIVE_FLOAT64, EMULATED_FLOAT64, CUDA_FLOAT64)
-KERNELS = (NATIVE_FLOAT32, EMULATED_FLOAT32, CUDA_FLOAT32, *FLOAT64)
+KERNELS = (NATIVE_FLOAT32, EMULATED_FLOAT32, CUDA_FLOAT32, WEBGPU_FLOAT32, *FLOAT64)
 
 
 def _running(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Variant:
     """The requested variant. The launcher of its engine replaces that of the CPU."""
     variant: Variant = request.param
-    if variant.engine in ("emulated", "cuda"):
+    if variant.engine in ("emulated", "cuda", "webgpu"):
         monkeypatch.setitem(LAUNCHERS, "cpu", launcher(variant.engine))
     return variant
 

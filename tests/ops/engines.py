@@ -9,13 +9,21 @@ import torch
 from snowsplat.ops.cuda import driver
 from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import launch_by
+from snowsplat.ops.webgpu import adapter, backend
+from snowsplat.ops.webgpu import launches as webgpu
+from snowsplat.ops.webgpu.tensor import from_host
 from snowsplat.util.native_layout import Fields
 
 from . import emulation
 
 
 def launcher(engine: str) -> Callable[[str, Fields], int]:
-    """A value for `native.LAUNCHERS["cpu"]`. Tests of "cuda" are skipped without a GPU."""
+    """A value for `native.LAUNCHERS["cpu"]`. Tests are skipped without the device of the engine."""
+    if engine == "webgpu":
+        if (why := adapter.why_unusable()) is not None:
+            pytest.skip(f"webgpu: {why}")
+        backend.enable()
+        return launch_on_webgpu
     if engine == "cuda" and not torch.cuda.is_available():
         pytest.skip("needs a GPU that torch can use")
     execute = emulation.execute if engine == "emulated" else execute_on_gpu
@@ -33,6 +41,23 @@ def execute_on_gpu(kernel: Kernel, name: str, blocks: int, fields: Fields) -> No
     driver.run(kernel, name, blocks, copied)
     for copy in copies.values():
         copy.here.copy_(copy.there)
+
+
+def launch_on_webgpu(name: str, fields: Fields) -> int:
+    """`ops.webgpu.launches.launch` with tensors of the CPU, whose memory it changes."""
+    given = {id(value): value for value in fields.values() if isinstance(value, torch.Tensor)}
+    wrapped = {key: from_host(value.detach()) for key, value in given.items()}
+    memories = {
+        value.untyped_storage().data_ptr(): wrapped[key].memory for key, value in given.items()
+    }
+    for key, value in given.items():
+        wrapped[key].memory = memories[value.untyped_storage().data_ptr()]
+    on_device = {key: wrapped.get(id(value), value) for key, value in fields.items()}
+    result = webgpu.launch(name, on_device)
+    for key, value in given.items():
+        storage = torch.empty(0, dtype=torch.uint8).set_(value.untyped_storage())
+        storage.copy_(wrapped[key].memory.host()[: len(storage)])
+    return result
 
 
 class _Copy:

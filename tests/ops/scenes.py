@@ -50,6 +50,7 @@ EMULATED_FLOAT32 = replace(NATIVE_FLOAT32, engine="emulated")
 EMULATED_FLOAT64 = replace(NATIVE_FLOAT64, engine="emulated")
 CUDA_FLOAT32 = replace(NATIVE_FLOAT32, engine="cuda")
 CUDA_FLOAT64 = replace(NATIVE_FLOAT64, engine="cuda")
+WEBGPU_FLOAT32 = replace(NATIVE_FLOAT32, engine="webgpu")
 
 
 #: Length of the longest images of the emulated kernels, in pixels; that of the others is 16384.

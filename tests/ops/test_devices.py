@@ -78,7 +78,7 @@ def test_the_environment_sets_the_default(monkeypatch):
 
 @pytest.mark.parametrize("text", ["gpu", "mps", "cuda:x", "cuda:-1", "", "0"])
 def test_unsupported_devices(text):
-    assert refused(text) == f"--device {text}: unsupported device; use cpu, cuda or cuda:1"
+    assert refused(text) == f"--device {text}: unsupported device; use cpu, cuda, cuda:1 or webgpu"
 
 
 def test_no_message_without_a_gpu(machine):

@@ -104,7 +104,12 @@ def test_nonfinite_splats_are_not_drawn(native: Variant, value: float) -> None:
 
 MANY = int(os.environ.get("SNOWSPLAT_FUZZ", "0"))
 #: Number of cases by engine: the emulation is a hundred times slower.
-EXAMPLES = {"native": MANY or 25, "emulated": max(MANY // 50, 3), "cuda": MANY or 25}
+EXAMPLES = {
+    "native": MANY or 25,
+    "emulated": max(MANY // 50, 3),
+    "cuda": MANY or 25,
+    "webgpu": max(MANY // 50, 3),
+}
 
 
 @pytest.mark.slow

@@ -199,6 +199,7 @@ def bin_splats(
     The CPU has no slots. On a GPU, `surplus` more tiles are counted for the farthest splat.
     """
     with_slots &= native.engine != "native"
+    with_slots |= native.engine == "webgpu"  # it always has them
     suffix = "" if native.dtype == torch.float32 else "_f64"
     packed = packed.to(native.dtype).contiguous()
     m, stride = packed.shape
@@ -253,7 +254,8 @@ def bin_splats(
         assert count == capacity
     if surplus:
         workspace[:8].view(torch.int64).add_(surplus)
-        workspace[16:].view(torch.int32).view(4, m)[2, -1] += surplus
+        counts = 0 if native.engine == "webgpu" else 2  # the row of the workspace
+        workspace[16:].view(torch.int32).view(4, m)[counts, -1] += surplus
         count += surplus
     instance_splat, instance_slot, slot_range = empty(count), empty(count), empty(2 * m)
     launch(

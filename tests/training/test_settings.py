@@ -218,7 +218,7 @@ def test_wrong_options(name, value, text, message, refused, tmp_path):
     [
         ("threads", 0, "0 is too small; use a whole number of at least 1"),
         ("threads", 1.5, "; use a whole number"),
-        ("device", "tpu", "'tpu' is unknown; use cpu, cuda or cuda:1"),
+        ("device", "tpu", "'tpu' is unknown; use cpu, cuda, cuda:1 or webgpu"),
         ("minutes", -1, "use a number above 0"),
         ("memory", "4 GBs", "'4 GBs' is not a size; use e.g. 4GB or 800MB"),
         ("quality", "bset", "use draft, normal or best"),

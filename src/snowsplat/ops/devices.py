@@ -30,9 +30,10 @@ def default_device(note: Callable[[Message], None] | None = None) -> torch.devic
 def resolve_device(
     text: str | None = None, note: Callable[[Message], None] | None = None
 ) -> torch.device:
-    """The device that a user chose: "cpu", "cuda" or "cuda:1"; None: the best available device.
+    """The device that a user chose: "cpu", "cuda", "cuda:1" or "webgpu"; None: the best one.
 
-    If `text` is None, the environment variable SNOWSPLAT_DEVICE is used.
+    The best one is never webgpu: nowhere was it measured to be faster than the CPU. If `text` is
+    None, the environment variable SNOWSPLAT_DEVICE is used.
 
     Args:
         note: called with a message if a GPU cannot be used and no device was requested.
@@ -46,12 +47,21 @@ def resolve_device(
         if not text:
             return default_device(note)
         source, remedy = f"SNOWSPLAT_DEVICE={text}", "set it to cpu to use the CPU"
+    if text == "webgpu":
+        from snowsplat.ops.webgpu import adapter, backend
+
+        why = adapter.why_unusable()
+        if why is not None:
+            raise UserError("{source}: {why}; {remedy}", source=source, why=why, remedy=remedy)
+        return backend.enable()
     try:
         device = torch.device(text)
     except RuntimeError:
         device = None
     if device is None or device.type not in ("cpu", "cuda"):
-        raise UserError("{source}: unsupported device; use cpu, cuda or cuda:1", source=source)
+        raise UserError(
+            "{source}: unsupported device; use cpu, cuda, cuda:1 or webgpu", source=source
+        )
     if device.type == "cpu":
         return torch.device("cpu")
     index = _current_index() if device.index is None else device.index
@@ -65,6 +75,10 @@ def device_name(device: torch.device) -> str:
     """A device in words: "NVIDIA H200 (cuda:0)", or the processor, its threads and instructions."""
     if device.type == "cuda":
         return f"{torch.cuda.get_device_name(device)} ({device})"
+    if device.type == "webgpu":
+        from snowsplat.ops.webgpu import adapter
+
+        return f"{adapter.description()} ({device})"
     return f"{processor_name()}, {get_num_threads()} threads, {isa()}"
 
 

@@ -59,7 +59,7 @@ def points_in_frusta(points: Tensor, frusta: Frusta) -> tuple[Tensor, Tensor]:
     check_tensor(op, "size", frusta.size, (views, 2), points)
     check_tensor(op, "depths", frusta.depths, (views, 2), points)
     check_tensor(op, "focal", frusta.focal, (views,), points)
-    counts, rates = points.new_empty(2, len(points)).unbind()
+    counts, rates = points.new_empty(len(points)), points.new_empty(len(points))
     launch(
         variant(op, points),
         n=len(points),
@@ -94,7 +94,7 @@ def points_in_spheres(points: Tensor, spheres: Tensor) -> tuple[Tensor, Tensor]:
     check_float(op, "points", points)
     check_tensor(op, "points", points, (None, 3), points)
     check_tensor(op, "spheres", spheres, (None, 4), points)
-    counts, nearest = points.new_empty(2, len(points)).unbind()
+    counts, nearest = points.new_empty(len(points)), points.new_empty(len(points))
     launch(
         variant(op, points),
         n=len(points),

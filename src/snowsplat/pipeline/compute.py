@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_DEVICE = re.compile(r"(cpu|cuda)(:\d+)?")
+_DEVICE = re.compile(r"(cpu|cuda)(:\d+)?|webgpu")
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class Compute(Settings):
     """The device and the number of threads for a computation.
 
     Attributes:
-        device: "cpu", "cuda" or "cuda:1"; None: a GPU if a usable one is present.
+        device: "cpu", "cuda", "cuda:1" or "webgpu"; None: an NVIDIA GPU if a usable one is
+            present.
         threads: None: all cores, divided between the processes that train together on this
             computer.
         deterministic: the sums on a GPU have a fixed order. On a CPU, results are always
@@ -44,8 +45,8 @@ class Compute(Settings):
         None,
         "Device to compute on.",
         "a GPU if there is one",
-        metavar="{cuda,cuda:N,cpu}",
-        allowed="cpu, cuda or cuda:1",
+        metavar="{cuda,cuda:N,cpu,webgpu}",
+        allowed="cpu, cuda, cuda:1 or webgpu",
         check=lambda device: None if _DEVICE.fullmatch(device) else "is unknown",
     )
     threads: int | None = flag(

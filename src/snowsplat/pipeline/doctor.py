@@ -68,6 +68,7 @@ _PACKAGES = (
 )
 
 _TORCH = "from snowsplat.ops.cuda.availability import inventory; result = inventory()"
+_WEBGPU = "from snowsplat.ops.webgpu.adapter import inventory; result = inventory()"
 _NATIVE = (
     "from snowsplat.util import native_library as n; isa = n.library()[0]; "
     "result = [isa, n.available_isas(), n.default_threads()]"
@@ -78,6 +79,7 @@ def examine() -> Iterator[Finding]:
     """Everything that is known, in the order in which it is shown. Takes a few seconds."""
     with ThreadPoolExecutor() as pool:
         torch = pool.submit(_in_new_process, _TORCH)
+        webgpu = pool.submit(_in_new_process, _WEBGPU)
         native = pool.submit(_in_new_process, _NATIVE)
         packages = [pool.submit(_package, package) for package in _PACKAGES]
         values: dict[str, Any] = {"version": __version__, "folder": str(_home())}
@@ -90,6 +92,7 @@ def examine() -> Iterator[Finding]:
         yield from _environment()
         yield _processor(*native.result())
         yield from _torch_and_gpus(*torch.result())
+        yield _webgpu(*webgpu.result())
         for package in packages:
             yield package.result()
 
@@ -196,6 +199,16 @@ def _kernels(found: dict[str, Any]) -> Finding:
     missing = bool(found["devices"]) and not built and not nvrtc
     text += ", MISSING: pip install nvidia-cuda-nvrtc-cu12" if missing else ""
     return Finding("GPU kernels", text, {"built_for": built, "nvrtc": nvrtc}, missing)
+
+
+def _webgpu(found: dict[str, Any] | None, problem: str) -> Finding:
+    """It is not used unless it is asked for, so it is no problem if it is missing."""
+    if found is None:
+        return Finding("WebGPU", f"not known: {problem}", {"problem": problem})
+    text = f"not usable: {found['why_unused']}"
+    if found["adapter"]:
+        text = f"{found['adapter']}; used only with --device webgpu, which is experimental"
+    return Finding("WebGPU", text, found)
 
 
 def _package(package: _Package) -> Finding:

@@ -47,9 +47,18 @@ def why_unusable() -> str | None:
     return backend.why_unsupported()
 
 
+def inventory() -> dict[str, Any]:
+    """For doctor: the adapter in words, or why the device cannot be used."""
+    why = why_unusable()
+    return {"adapter": None if why else _in_words(_found().info), "why_unused": why}
+
+
 def description() -> str:
     """The adapter in words: "llvmpipe (LLVM 15.0.6, 256 bits), Vulkan, computes on the CPU"."""
-    found = gpu().adapter
+    return _in_words(gpu().adapter)
+
+
+def _in_words(found: Any) -> str:
     parts = [found["device"] or found["description"] or found["vendor"], found["backend_type"]]
     if found["adapter_type"] == "CPU":
         parts.append("computes on the CPU")
@@ -106,10 +115,11 @@ class Gpu:
         with self.lock:
             if self._encoder is None:
                 return
-            if self._numbers:
-                self.device.queue.write_buffer(self._uniforms, 0, self._numbers)
-            self.device.queue.submit([self._encoder.finish()])
+            recorded, numbers = self._encoder, self._numbers
             self._encoder, self._numbers = None, bytearray()
+            if numbers:
+                self.device.queue.write_buffer(self._uniforms, 0, numbers)
+            self.device.queue.submit([recorded.finish()])
 
     def write(self, buffer: Any, offset: int, data: Any) -> None:
         """Copy ``data``, a multiple of 4 bytes, to a buffer, after the recorded commands."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from snowsplat.ops.webgpu import elementwise  # noqa: F401 -- registers kernels
 from snowsplat.ops.webgpu import tensor as tensors
 from snowsplat.util.errors import UserError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import struct
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -25,13 +25,11 @@ def run(file: str, entry: str, groups: int, fields: Mapping[str, Any]) -> None:
     Args:
         file, entry: a kernel in ``native/wgsl/<file>.wgsl``.
         groups: the number of work groups; those of more than 65535 are spread over two dimensions.
-        fields: the tensors and numbers by the names of the variables in WGSL; more are ignored.
+        fields: the tensors and numbers by the names of the variables in WGSL. Tensors that are
+            missing are null, and numbers 0; more than the kernel has are ignored.
 
     Raises:
         UserError: a tensor is larger than the adapter allows.
-        KeyError: a variable has no value.
-        ValueError: a tensor does not begin at a multiple of 256 bytes, and the kernel has no
-            offset for it.
     """
     _run(_pipeline(file, entry), shader(file), entry, groups, fields)
 
@@ -51,16 +49,19 @@ def _run(pipeline: Any, code: Shader, entry: str, groups: int, fields: Mapping[s
     offsets: dict[str, int] = {}
     bound: list[dict[str, Any]] = []
     written: list[Memory] = []
+    copies: list[tuple[_Copied, bool]] = []
     device = gpu()
     with device.lock:
         for name in names:
-            binding, tensor = code.bindings[name], fields[name]
+            binding, tensor = code.bindings[name], fields.get(name)
             if tensor is None or tensor.numel() == 0:
                 resource = {"buffer": _nothing(entry, name)}
             else:
-                resource, offsets[name] = _range(entry, name, tensor, code)
+                resource, offsets[name], copied = _range(entry, name, tensor, code)
                 if binding.written:
                     written.append(tensor.memory)
+                if copied is not None:  # kept until the kernel is recorded
+                    copies.append((copied, binding.written))
             bound.append({"binding": binding.index, "resource": resource})
         if has_numbers:
             numbers = [_number(name, kind, fields, offsets) for name, kind in code.numbers]
@@ -77,19 +78,24 @@ def _run(pipeline: Any, code: Shader, entry: str, groups: int, fields: Mapping[s
         work.set_bind_group(0, group)
         work.dispatch_workgroups(across, -(-groups // across), 1)
         work.end()
+        for copied, is_written in copies:
+            if is_written:
+                copied.copy_back()
         for memory in written:
             memory.changed_on_device()
 
 
-def _range(entry: str, name: str, tensor: DeviceTensor, code: Shader) -> tuple[dict[str, Any], int]:
-    """The part of a buffer with the elements of a tensor, and the offset in it, in words."""
+def _range(
+    entry: str, name: str, tensor: DeviceTensor, code: Shader
+) -> tuple[dict[str, Any], int, _Copied | None]:
+    """The part of a buffer with the elements of a tensor, and the offset in it, in words.
+
+    A tensor that begins at an address that no binding can have is copied, if the kernel has no
+    offset for it.
+    """
     begin, end = tensor.byte_range
     buffer = tensor.memory.buffer()
     first = begin // ALIGNMENT * ALIGNMENT
-    if first != begin and (f"{name}_offset", "u32") not in code.numbers:
-        raise ValueError(
-            f"{entry}: {name} begins at byte {begin}, not at a multiple of {ALIGNMENT}"
-        )
     size = -(-(end - first) // 4) * 4
     if size > gpu().largest:
         raise UserError(
@@ -99,18 +105,33 @@ def _range(entry: str, name: str, tensor: DeviceTensor, code: Shader) -> tuple[d
             size=size,
             largest=gpu().largest,
         )
-    return {"buffer": buffer, "offset": first, "size": size}, (begin - first) // 4
+    if first == begin or (f"{name}_offset", "u32") in code.numbers:
+        return {"buffer": buffer, "offset": first, "size": size}, (begin - first) // 4, None
+    size = -(-(end - begin) // 4) * 4
+    copied = _Copied(buffer, begin, Memory(size), size)
+    gpu().encoder().copy_buffer_to_buffer(buffer, begin, copied.memory.buffer(), 0, size)
+    return {"buffer": copied.memory.buffer(), "offset": 0, "size": size}, 0, copied
+
+
+class _Copied(NamedTuple):
+    """The copy of a part of a buffer."""
+
+    buffer: Any
+    begin: int
+    memory: Memory
+    size: int
+
+    def copy_back(self) -> None:
+        own = self.memory.buffer()
+        gpu().encoder().copy_buffer_to_buffer(own, 0, self.buffer, self.begin, self.size)
 
 
 def _number(name: str, kind: str, fields: Mapping[str, Any], offsets: dict[str, int]) -> Any:
-    if name in fields:
-        value = fields[name]
-    elif name.startswith("has_"):
-        return int(fields[name[4:]] is not None)
-    elif name.endswith("_offset"):
+    if name.endswith("_offset"):
         return offsets.get(name[:-7], 0)
-    else:
-        raise KeyError(name)
+    if name.startswith("has_") and name not in fields:
+        return int(fields.get(name[4:]) is not None)
+    value = fields.get(name, 0)  # the numbers are those of all kernels of a file
     if kind == "f32":
         return float(value)
     return int(value) & 0xFFFFFFFF if kind == "u32" else int(value)

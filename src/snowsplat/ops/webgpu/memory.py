@@ -22,10 +22,15 @@ _KEPT = 64 << 20  # bytes of free buffers that are kept in any case
 
 
 class _Pool:
-    """Free buffers, by their size. Commands run in order, so a buffer can be reused at once."""
+    """Free buffers, by their size. Commands run in order, so a buffer can be reused at once.
+
+    The buffers in use are here, too: a buffer that only its `Memory` refers to could be deleted
+    together with it by Python, before `give` is called.
+    """
 
     def __init__(self) -> None:
         self._free: dict[int, list[Any]] = defaultdict(list)
+        self._in_use: dict[int, Any] = {}
         self._lock = threading.RLock()  # a tensor may be deleted while this thread has the lock
         self.used = self.free = 0  # bytes
 
@@ -47,14 +52,18 @@ class _Pool:
                 largest=gpu().largest,
             )
         with self._lock:
-            self.used += rounded
+            found = None
             if self._free[rounded]:
                 self.free -= rounded
-                return self._free[rounded].pop()
-        return gpu().buffer(rounded)
+                found = self._free[rounded].pop()
+            buffer = gpu().buffer(rounded) if found is None else found
+            self.used += rounded
+            self._in_use[id(buffer)] = buffer
+            return buffer
 
     def give(self, buffer: Any) -> None:
         with self._lock:
+            del self._in_use[id(buffer)]
             self.used -= buffer.size
             if self.free + buffer.size <= max(_KEPT, self.used):
                 self.free += buffer.size
@@ -73,8 +82,9 @@ class Memory:
     """
 
     def __init__(self, size: int, host: Tensor | None = None) -> None:
+        self._buffer: Any = None
         self.size = size
-        self._host, self._buffer = host, None
+        self._host = host
         # Which copies are up to date. New memory has no content, so both are.
         self._on_host, self._on_device = True, host is None
 

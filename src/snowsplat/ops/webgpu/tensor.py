@@ -7,13 +7,14 @@ but slow for large tensors. `fallbacks` counts them.
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils import _pytree as pytree
+from torch.utils._mode_utils import no_dispatch
 
 from snowsplat.ops.webgpu.memory import Memory
 
@@ -114,13 +115,47 @@ def _shape_only(tensor: Tensor, size: int) -> Tensor:
     return elements.as_strided(tensor.size(), tensor.stride(), tensor.storage_offset())
 
 
+class _Kind(NamedTuple):
+    """What is needed of an operation: reading it from the schema takes longer than most of them.
+
+    Attributes:
+        name: such as "mul.Tensor".
+        is_view: the result has the memory of the first argument.
+        reshapes: it changes the shape of its argument, and not the content.
+        written: position and name of the arguments that it changes.
+    """
+
+    name: str
+    is_view: bool
+    reshapes: bool
+    written: tuple[tuple[int, str], ...]
+
+
+@functools.cache
+def _kind(func: Any) -> _Kind:
+    arguments = enumerate(func._schema.arguments)
+    return _Kind(
+        str(func).removeprefix("aten."),
+        func.is_view,
+        torch.Tag.inplace_view in func.tags,
+        tuple((i, x.name) for i, x in arguments if x.alias_info and x.alias_info.is_write),
+    )
+
+
 def dispatch(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Run an operation of torch, of which at least one argument is a tensor on the device."""
-    name = func._schema.name.removeprefix("aten::")
-    if func.is_view:
-        made = func(_shapes(args[0]), *args[1:], **kwargs)
-        return pytree.tree_map(lambda view: DeviceTensor(args[0].memory, view), made)
-    kernel = KERNELS.get(name)
+    kind = _kind(func)
+    if kind.is_view:
+        made = func(args[0].shape_only, *args[1:], **kwargs)
+        if isinstance(made, Tensor):
+            return DeviceTensor(args[0].memory, made)
+        return [DeviceTensor(args[0].memory, view) for view in made]
+    if kind.reshapes:
+        with no_dispatch():
+            func(*args, **kwargs)
+        args[0].shape_only = func(args[0].shape_only, *args[1:], **kwargs)
+        return args[0]
+    kernel = KERNELS.get(kind.name)
     if kernel is not None:
         result = kernel(*args, **kwargs)
         if result is not NotImplemented:
@@ -128,62 +163,63 @@ def dispatch(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     return on_cpu(func, args, kwargs)
 
 
-def _shapes(tensor: Any) -> Any:
-    return tensor.shape_only if isinstance(tensor, DeviceTensor) else tensor
+class _Hosts:
+    """Tensors on the CPU for the arguments of an operation, with the same memory."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.of: dict[int, Tensor] = {}  # by the id of the argument
+        self.arguments: dict[int, Tensor] = {}  # by the id of the tensor on the CPU
+
+    def replaced(self, value: Any) -> Any:
+        """An argument for the operation on the CPU."""
+        if isinstance(value, DeviceTensor):
+            if id(value) not in self.of:
+                if not value.memory.is_on_host:
+                    fallbacks[self.name] += 1
+                host = self.of[id(value)] = value.on_host()
+                self.arguments[id(host)] = value
+            return self.of[id(value)]
+        if isinstance(value, Tensor):
+            self.arguments[id(value)] = value
+        elif isinstance(value, (list, tuple)):
+            return [self.replaced(each) for each in value]
+        elif isinstance(value, torch.device) and value.type == DEVICE:
+            return torch.device("cpu")
+        return value
+
+    def wrapped(self, result: Any) -> Any:
+        """A result of the operation as one on the device."""
+        if isinstance(result, (list, tuple)):
+            return type(result)(self.wrapped(each) for each in result)
+        if not isinstance(result, Tensor):
+            return result
+        if id(result) in self.arguments:
+            return self.arguments[id(result)]
+        if result.numel():  # it may be a view that is not declared as one
+            begin = result.untyped_storage().data_ptr()
+            for argument in self.arguments.values():
+                if isinstance(argument, DeviceTensor):
+                    memory = argument.memory.host()
+                    if memory.data_ptr() == begin:
+                        return DeviceTensor(argument.memory, _shape_only(result, memory.numel()))
+        return from_host(result)
 
 
 def on_cpu(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Run an operation on the CPU, with tensors there that share the memory of the arguments."""
-    leaves, structure = pytree.tree_flatten((args, kwargs))
-    device = torch.device("cpu")
-    hosts: dict[int, Tensor] = {}
-    for leaf in leaves:
-        if isinstance(leaf, DeviceTensor):
-            if not leaf.memory.is_on_host:
-                fallbacks[func._schema.name] += 1
-            hosts[id(leaf)] = leaf.on_host()
-    given = [
-        hosts[id(leaf)]
-        if isinstance(leaf, DeviceTensor)
-        else device
-        if isinstance(leaf, torch.device) and leaf.type == DEVICE
-        else leaf
-        for leaf in leaves
-    ]
-    host_args, host_kwargs = pytree.tree_unflatten(given, structure)
-    made = func(*host_args, **host_kwargs)
-    _mark_changes(func, args, kwargs, hosts)
+    kind = _kind(func)
+    hosts = _Hosts(kind.name)
+    given = [hosts.replaced(value) for value in args]
+    made = func(*given, **{name: hosts.replaced(value) for name, value in kwargs.items()})
+    for i, name in kind.written:
+        changed = args[i] if i < len(args) else kwargs.get(name)
+        for tensor in changed if isinstance(changed, (list, tuple)) else [changed]:
+            if isinstance(tensor, DeviceTensor):
+                if hosts.of[id(tensor)].shape != tensor.shape:
+                    raise NotImplementedError(f"{func}: webgpu tensors cannot change their size")
+                tensor.memory.changed_on_host()
     goes = kwargs.get("device")
     if goes is not None and torch.device(goes).type != DEVICE:
         return made
-    by_host = {id(host): leaf for leaf in leaves if (host := hosts.get(id(leaf))) is not None}
-    by_memory = {host.untyped_storage().data_ptr(): by_host[id(host)] for host in hosts.values()}
-    plain = {id(leaf) for leaf in leaves if isinstance(leaf, Tensor)}
-
-    def wrapped(result: Any) -> Any:
-        if not isinstance(result, Tensor) or id(result) in plain:
-            return result
-        if id(result) in by_host:
-            return by_host[id(result)]
-        shared = by_memory.get(result.untyped_storage().data_ptr()) if result.numel() else None
-        if shared is not None:  # a view that is not declared as one
-            size = shared.memory.host().numel()
-            return DeviceTensor(shared.memory, _shape_only(result, size))
-        return from_host(result)
-
-    return pytree.tree_map(wrapped, made)
-
-
-def _mark_changes(
-    func: Any, args: tuple[Any, ...], kwargs: dict[str, Any], hosts: dict[int, Tensor]
-) -> None:
-    """After an operation on the CPU: the device does not have what it has written."""
-    for i, argument in enumerate(func._schema.arguments):
-        if argument.alias_info is None or not argument.alias_info.is_write:
-            continue
-        value = kwargs.get(argument.name, args[i] if i < len(args) else None)
-        for tensor in pytree.tree_leaves(value):
-            if isinstance(tensor, DeviceTensor):
-                if hosts[id(tensor)].shape != tensor.shape:
-                    raise NotImplementedError(f"{func}: webgpu tensors cannot change their size")
-                tensor.memory.changed_on_host()
+    return hosts.wrapped(made)

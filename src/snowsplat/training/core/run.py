@@ -133,12 +133,14 @@ class Run:
             note: takes a line for the user, for example about what a part has found.
 
         Raises:
-            UserError: the dataset has no training views, or some points are so far apart that
+            UserError: the dataset has no training views, the device cannot train with these
+                settings, or some points are so far apart that
                 float32 cannot represent their Gaussians; two parts have the same name; or the state
                 is not valid, see `load_state`.
         """
         if not dataset.train:
             raise UserError("the dataset has no training views; check its folder and its split")
+        _refuse_what_is_missing(device, config, shards)
         self.dataset = dataset
         sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
         self.config = config = config.capped(sizes[len(sizes) // 2], len(sizes))
@@ -312,6 +314,20 @@ class Run:
         """
         load_state(self, tensors)
         self.count()
+
+
+def _refuse_what_is_missing(
+    device: torch.device | None, config: TrainConfig, shards: Shards
+) -> None:
+    """Raises UserError: the device has no kernels for one of the settings."""
+    if device is None or device.type != "webgpu":
+        return
+    if config.refine_poses:
+        raise UserError("--refine-poses: the device webgpu cannot refine poses; use cpu or cuda")
+    if config.batch > 1:
+        raise UserError("--batch: the device webgpu takes one photo per step; use cpu or cuda")
+    if shards.size > 1:
+        raise UserError("--processes: the device webgpu trains in one process; use cpu or cuda")
 
 
 def _with_valid_names(parts: Sequence[Part]) -> list[Part]:
