@@ -39,8 +39,10 @@ def test_a_gap_around_a_subject():
     assert all("80° gap" in str(reason) for reason in found.reasons)
 
 
-def test_a_wall_photographed_from_the_front_has_no_gap_behind_it():
+def test_photos_of_one_side_have_no_gap_behind_it():
     assert len(advice(around(range(-60, 61, 10)), POINTS).places) == 0
+    flight = [photo([x, -4.0, z], target=(x, 0.0, z + 0.4)) for x in (-1, 0, 1) for z in (-1, 0, 1)]
+    assert len(advice(flight, POINTS).places) == 0
 
 
 def test_a_photo_far_from_the_others():

@@ -17,7 +17,7 @@ _POINTS = 20_000
 #: Two photos are neighbours if they share at least this share of the points of one of them.
 _NEIGHBOURS = 0.05
 #: At a smaller step, points move by less than a pixel in photos of 1000 pixels: one place.
-_SAME_PLACE = 1e-3
+SAME_PLACE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _places(steps: np.ndarray) -> np.ndarray:
     photo of a place."""
     place = np.arange(len(steps))
     for i in range(len(steps)):
-        firsts = place[:i][(place[:i] == np.arange(i)) & (steps[i, :i] < _SAME_PLACE)]
+        firsts = place[:i][(place[:i] == np.arange(i)) & (steps[i, :i] < SAME_PLACE)]
         place[i] = firsts.min(initial=i)
     return place
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from snowsplat.sfm.report.coverage import SAME_PLACE
 from snowsplat.sfm.report.scene_map import PlacedPhoto
 from snowsplat.util.messages import Message, message
 
@@ -19,8 +20,6 @@ _FEWEST = 3
 # Photos surround a subject if they look at it from directions that cover at least half of a circle.
 # Then a gap of at least 40 degrees between them is worth a photo.
 _SURROUND, _GAP = math.radians(180), math.radians(40)
-# Photos from one place are nearer to one another than this, in units of the largest distance.
-_SAME_PLACE = 1e-6
 # Directions of a gap are suggested at this distance from one another.
 _SPACING = math.radians(20)
 # A photo is far from the others if the nearest one is this many times as far away as usual.
@@ -65,9 +64,11 @@ def _gaps_around(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarra
     """Places in the largest gaps between cameras that surround a subject."""
     subject = _focus(centres, ahead)
     out = (centres - subject)[:, [0, 2]]
-    # Only cameras that look at the subject; those of a room look away from its middle.
+    # Only cameras that look at the subject; those of a room look away from its middle. Most of them
+    # are beside it; those of a drone may look down.
     toward = (-(centres - subject) * ahead).sum(1) > 0.5 * np.linalg.norm(centres - subject, axis=1)
-    if toward.sum() < max(_FEWEST, 0.7 * len(centres)):
+    beside = (-out * ahead[:, [0, 2]]).sum(1) > 0.5 * np.linalg.norm(out, axis=1)
+    if (toward & beside).sum() < max(_FEWEST, 0.7 * len(centres)):
         return []
     angles = np.sort(np.arctan2(out[toward, 1], out[toward, 0]))
     gaps = np.diff(angles, append=angles[0] + 2 * math.pi)
@@ -96,7 +97,7 @@ def _lonely(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarray, Me
     """Places between photos that are far from all others and their nearest neighbours."""
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     # The photo itself, and other photos from its place, such as the views of a panorama.
-    apart[apart <= _SAME_PLACE * apart.max()] = np.inf
+    apart[apart <= SAME_PLACE * apart.max()] = np.inf
     nearest = apart.min(1)
     usual = float(np.median(nearest))
     lonely = np.flatnonzero(nearest > max(_FAR * usual, 1e-9))
