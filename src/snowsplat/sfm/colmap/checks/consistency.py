@@ -50,7 +50,7 @@ _MIN_AGREEING = 0.5
 _CONFIRMED = 0.8
 _TORN = 0.3
 _MIN_MISS_DISTANCE = 4.0  # of a miss, in units of the ``max_error`` of `check_pairs`
-#: A model is bent if its agreement is less than this (`agreement_of`). That of right models is 0.99
+#: A model is bent if its agreement is less than this (`agreement_of`). That of right models is 0.98
 #: or more, and 0.93 in a room whose carpet repeats; of three bent ones, it is 0.61 to 0.79.
 CONSISTENT = 0.92
 _WORST, _MIN_WORST = 0.05, 3  # the share of the pairs that `agreement_of` considers, their number
