@@ -135,8 +135,8 @@ def clean(
     Args:
         cameras: those of the photos with which the scene was trained.
         quality: the larger, the better; for example the PSNR of held-out photos.
-        report: as in `coverage`; then with the number of floaters that are kept or removed, of
-            all, and the word "floaters".
+        report: as in `coverage`; then with the number of trials to remove a group, of the most
+            that there may be, and the word "trials".
     """
     found = coverage(gaussians, cameras, report)
     kept = ~found.useless
@@ -144,12 +144,13 @@ def clean(
     floaters = floaters[found.position[floaters].argsort(stable=True)]
     best = quality(gaussians.select(kept))
     groups = list(floaters.tensor_split(_GROUPS))
-    for _ in range(_TRIALS):
+    for trial in range(_TRIALS):
         while groups and not len(groups[0]):
             del groups[0]
         if not groups:
             break
-        report(len(floaters) - sum(map(len, groups)), len(floaters), "floaters")
+        most = trial + sum(2 * len(group) - 1 for group in groups if len(group))
+        report(trial, min(most, _TRIALS), "trials")
         group = groups.pop(0)
         kept[group] = False
         rest = quality(gaussians.select(kept))

@@ -15,6 +15,7 @@ ITEMS = (
     message("photos"),
     message("frames"),
     message("views"),
+    message("trials"),
     message("files"),
 )
 #: A text in each language.
