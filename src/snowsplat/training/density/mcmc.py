@@ -155,8 +155,10 @@ class McmcDensityControl:
 
     def _drawn(self, weights: Tensor, count: int) -> Tensor:
         """(count,) int64: positions in ``weights`` (M,) in 0..1, each drawn with its weight."""
-        if weights.device.type == "cpu":
-            return torch.multinomial(weights, count, replacement=True, generator=self.generator)
+        if weights.device.type != "cuda":
+            host = weights.cpu()
+            drawn = torch.multinomial(host, count, replacement=True, generator=self.generator)
+            return drawn.to(weights.device)
         generator = torch.Generator(weights.device)
         generator.manual_seed(self._seed())
         share = torch.rand(count, generator=generator, dtype=torch.float64, device=weights.device)
