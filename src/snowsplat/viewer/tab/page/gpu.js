@@ -195,10 +195,30 @@ export class Gpu {
         return module;
     }
 
-    /** @param {string} file @param {string} entry @returns {Kernel} */
+    /**
+     * Compile the kernels of operations, which takes long with some drivers.
+     * @param {string[]} operations @param {(number: number, of: number) => void} report
+     */
+    async prepare(operations, report) {
+        const steps = new Map(operations.flatMap(name => this.plan[name].steps).map(step => [step.entry, step.file]));
+        let number = 0;
+        for (const [entry, file] of steps) {
+            report(++number, steps.size);
+            const compute = { module: this.module(file), entryPoint: entry };
+            this.describe(file, entry, await this.device.createComputePipelineAsync({ layout: "auto", compute }));
+        }
+    }
+
+    /** @param {string} file @param {string} entry */
     kernel(file, entry) {
         const known = this.kernels.get(entry);
         if (known) return known;
+        const compute = { module: this.module(file), entryPoint: entry };
+        return this.describe(file, entry, this.device.createComputePipeline({ layout: "auto", compute }));
+    }
+
+    /** What a kernel binds. @param {string} file @param {string} entry @param {any} pipeline @returns {Kernel} */
+    describe(file, entry, pipeline) {
         const code = this.shaders[file].replace(/\/\/[^\n]*/g, "");
         const starts = [...code.matchAll(FUNCTION)];
         const words = new Map(
@@ -217,8 +237,6 @@ export class Gpu {
         const numbers = [...fields.matchAll(/(\w+)\s*:\s*(\w+)/g)].map(
             field => /** @type {[string, string]} */ ([field[1], field[2]]),
         );
-        const compute = { module: this.module(file), entryPoint: entry };
-        const pipeline = this.device.createComputePipeline({ layout: "auto", compute });
         const kernel = { bindings, uniform, numbers, pipeline };
         this.kernels.set(entry, kernel);
         return kernel;

@@ -6,11 +6,12 @@ import { listen } from "../../live/page/input.js";
 import { dot } from "../../live/page/vectors.js";
 import { Gpu } from "./gpu.js";
 import { ply } from "./ply.js";
-import { Trainer } from "./trainer.js";
+import { OPERATIONS, Trainer } from "./trainer.js";
 import { say, switchLanguage, translate } from "./words.js";
 
-const LONGEST = 640; // pixels: the longer side of the image while it trains
+const [COARSEST, LONGEST] = [128, 960]; // pixels: the longer side of the image while it trains
 const BUSY = 60; // milliseconds of training between two images
+const [FAST, SLOW] = [15, 80]; // milliseconds: images that take less become larger, others smaller
 const PSNR_EVERY = 100; // steps
 
 const data = JSON.parse(byId("data").textContent);
@@ -57,6 +58,7 @@ class Page {
         this.failed = false;
         this.full = false; // the memory does not suffice
         this.photo = 0;
+        this.longest = 2 * COARSEST;
         /** Steps between two images. */
         this.pace = 1;
         this.psnr = Number.NaN;
@@ -76,7 +78,8 @@ class Page {
     /** The view of the camera in the window. */
     view() {
         const { clientWidth, clientHeight } = byId("stage");
-        const scale = Math.min(1, LONGEST / Math.max(clientWidth, clientHeight, 1));
+        const longest = this.paused || this.trainer.done ? LONGEST : this.longest;
+        const scale = Math.min(1, longest / Math.max(clientWidth, clientHeight, 1));
         const size = {
             width: Math.max(16, Math.round(scale * clientWidth)),
             height: Math.max(16, Math.round(scale * clientHeight)),
@@ -90,11 +93,15 @@ class Page {
 
     async show() {
         this.moved = false;
+        const begin = performance.now();
         const view = this.view();
         const picture = await this.trainer.renderer.picture(this.trainer.gaussians, view);
         const canvas = byId("image");
         if (canvas.width !== view.width || canvas.height !== view.height)
             Object.assign(canvas, { width: view.width, height: view.height });
+        const took = performance.now() - begin;
+        const factor = took < FAST ? 1.25 : took > SLOW ? 0.7 : 1;
+        this.longest = Math.max(COARSEST, Math.min(LONGEST, factor * this.longest));
         this.context.putImageData(new ImageData(picture, view.width, view.height), 0, 0);
     }
 
@@ -133,6 +140,10 @@ class Page {
 
     /** Train and draw, until the page is closed. */
     async run() {
+        this.tell();
+        byId("notice").textContent = say("first");
+        await this.show();
+        byId("notice").textContent = "";
         for (;;) {
             await new Promise(requestAnimationFrame);
             if (!this.full) {
@@ -163,6 +174,7 @@ class Page {
 
     pause() {
         this.paused = !this.paused;
+        this.look();
     }
 
     async download() {
@@ -180,7 +192,6 @@ const start = async () => {
     const gpu = await Gpu.open(data.shaders, data.plan);
     if (!gpu) {
         byId("notice").textContent = say("noWebgpu");
-        for (const button of ["pause", "next", "download"]) byId(button).disabled = true;
         return;
     }
     /** @type {import('./trainer.js').Photo[]} */
@@ -190,7 +201,9 @@ const start = async () => {
         photos.push({ ...view, pixels: await pixelsOf(view.jpeg, view.width, view.height) });
         view.jpeg = "";
     }
-    byId("notice").textContent = "";
+    await gpu.prepare(OPERATIONS, (number, kernels) => {
+        byId("notice").textContent = say("preparing", { number, kernels });
+    });
     const page = new Page(new Trainer(gpu, firstGaussians(), photos, data.scene.extent, data.steps));
     Object.assign(window, { snowsplat: page }); // for the console of the browser
     listen(byId("stage"), {
@@ -200,6 +213,7 @@ const start = async () => {
         hovered: () => {},
         keys: { n: () => page.goToNext(), " ": () => page.pause(), r: () => page.camera.reset() },
     });
+    for (const button of ["pause", "next", "download"]) byId(button).disabled = false;
     byId("pause").onclick = () => page.pause();
     byId("next").onclick = () => page.goToNext();
     byId("download").onclick = () => page.download();

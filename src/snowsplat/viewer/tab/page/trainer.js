@@ -16,7 +16,19 @@ const [MEANS_FIRST, MEANS_LAST] = [1.6e-4, 1.6e-6]; // of the extent
 const SSIM = 0.2; // weight of 1 − SSIM in the loss
 const [REFINE_EVERY, REFINE_UNTIL] = [100, 0.6]; // steps; of all steps
 const REFINE_FROM = 0.1;
-const DEGREES_UNTIL = 0.5; // of all steps: then all degrees of the spherical harmonics are in use
+const DEGREE_EVERY = 1000; // steps
+// The photos are smaller at first: factor, share of the steps until which it is used.
+const SMALLER = [
+    [4, 0.1],
+    [2, 0.3],
+];
+const SMALLEST = 64; // pixels of the longer side of a smaller photo, at least
+/** The operations of a step. */
+export const OPERATIONS = [
+    ...["project_cull", "project_fwd", "splats_prepare", "splats_sort", "tiles_count", "tiles_fill", "rasterize_fwd"],
+    ...["photometric", "photometric_means", "rasterize_bwd", "splats_reduce", "accumulate_screen_statistics"],
+    ...["project_rows", "adam_update"],
+];
 const MOST = 200_000; // Gaussians
 const REPORT = 32; // bytes for each step: the instances, and three means of the loss
 const MOST_STEPS = 64; // between two reports
@@ -27,6 +39,24 @@ const generator = seed => () => {
     let t = Math.imul(seed ^ (seed >>> 15), 1 | seed);
     t = (t + Math.imul(t ^ (t >>> 7), 61 | t)) ^ t;
     return ((t ^ (t >>> 14)) >>> 0) / 4294967296;
+};
+
+/** A photo of 1 / factor of the size. @param {Photo} photo @param {number} factor @returns {Photo} */
+const smaller = (photo, factor) => {
+    const [width, height] = [Math.floor(photo.width / factor), Math.floor(photo.height / factor)];
+    const pixels = new Uint8Array(Math.ceil((3 * width * height) / 4) * 4);
+    for (let c = 0; c < 3; c++)
+        for (let y = 0; y < height; y++)
+            for (let x = 0; x < width; x++) {
+                let sum = 0;
+                for (let v = 0; v < factor; v++) {
+                    const row = (c * photo.height + factor * y + v) * photo.width + factor * x;
+                    for (let u = 0; u < factor; u++) sum += photo.pixels[row + u];
+                }
+                pixels[(c * height + y) * width + x] = Math.round(sum / factor ** 2);
+            }
+    const { fx, fy, cx, cy } = photo;
+    return { ...photo, width, height, pixels, fx: fx / factor, fy: fy / factor, cx: cx / factor, cy: cy / factor };
 };
 
 export class Trainer {
@@ -45,6 +75,8 @@ export class Trainer {
         this.training = photos.filter(photo => !photo.heldOut);
         this.heldOut = photos.filter(photo => photo.heldOut);
         this.random = generator(1);
+        /** Smaller photos. @type {Map<Photo, {factor: number, photo: Photo}>} */
+        this.reduced = new Map();
         /** The photos of this pass that are not used yet. @type {Photo[]} */
         this.queue = [];
         this.step = 0;
@@ -73,7 +105,7 @@ export class Trainer {
     }
 
     get gaussians() {
-        const degree = Math.min(3, Math.floor((4 * this.step) / (DEGREES_UNTIL * this.steps)));
+        const degree = Math.min(3, Math.floor(this.step / DEGREE_EVERY));
         return { count: this.count, degree, buffers: this.sets[0] };
     }
 
@@ -104,6 +136,18 @@ export class Trainer {
         if (this.step % REFINE_EVERY === 0 && share >= REFINE_FROM && share <= REFINE_UNTIL) await this.refine();
     }
 
+    /** A photo in the size that the step needs. @param {Photo} photo */
+    sized(photo) {
+        const fits = (/** @type {number} */ factor) => Math.max(photo.width, photo.height) >= SMALLEST * factor;
+        const [factor] = SMALLER.find(([by, until]) => this.step < until * this.steps && fits(by)) ?? [1];
+        const known = this.reduced.get(photo);
+        if (factor === 1) this.reduced.delete(photo);
+        if (factor === 1 || known?.factor === factor) return known && factor > 1 ? known.photo : photo;
+        const made = smaller(photo, factor);
+        this.reduced.set(photo, { factor, photo: made });
+        return made;
+    }
+
     /** @param {number} k number of its report */
     queueStep(k) {
         const { gpu, renderer, valid } = this;
@@ -115,7 +159,7 @@ export class Trainer {
                 [this.queue[i], this.queue[j]] = [this.queue[j], this.queue[i]];
             }
         }
-        const photo = /** @type {Photo} */ (this.queue.pop());
+        const photo = this.sized(/** @type {Photo} */ (this.queue.pop()));
         const frame = renderer.draw(this.gaussians, photo);
         this.step++;
         const { width, height, tiles, packed, ids, capacity, required } = frame;
