@@ -12,7 +12,7 @@ from snowsplat.sfm.colmap.database import (
     VerifiedPair,
     closing_database,
     copy_without_verification,
-    displacement_of,
+    displacements_of,
     feature_counts,
     open_database,
     read_descriptors,
@@ -210,4 +210,4 @@ def test_matches_of_a_logo_do_not_hide_the_displacement(path, moving, expected):
         database.write_keypoints(2, second.astype(np.float32))
         database.write_two_view_geometry(1, 2, geometry)
     pair = VerifiedPair(1, 2, 100)
-    assert displacement_of(path, [pair], still=6.4) == pytest.approx(expected, abs=1e-3)
+    assert displacements_of(path, [pair], still=6.4) == [pytest.approx(expected, abs=1e-3)]

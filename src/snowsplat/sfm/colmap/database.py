@@ -282,13 +282,11 @@ def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
     return descriptors[np.argsort(-scale, kind="stable")[:limit]]
 
 
-def displacement_of(path: Path, pairs: Sequence[VerifiedPair], still: float) -> float:
-    """Typical distance in pixels between the positions of a match in the two photos.
+def displacements_of(path: Path, pairs: Sequence[VerifiedPair], still: float) -> list[float]:
+    """For each pair, the median distance in pixels between the positions of a match in the photos.
 
-    For each pair, this is the median over its matches; of these medians, it is the 90% quantile. A
-    lower quantile would be nearly zero in a slow video, where the frames of many pairs are nearly
-    equal. If a quarter of the matches moves by more than ``still`` pixels, the median is that of
-    these matches: the others may be those of a logo, which does not move with the scene.
+    If a quarter of the matches moves by more than ``still`` pixels, the median is that of these
+    matches: the others may be those of a logo, which does not move with the scene.
     """
     medians = []
     with closing_database(path) as database:
@@ -301,4 +299,4 @@ def displacement_of(path: Path, pairs: Sequence[VerifiedPair], still: float) -> 
             moving = lengths > still
             lengths = lengths[moving] if moving.mean() >= _MOVING_SHARE else lengths
             medians.append(float(np.median(lengths)))
-    return float(np.quantile(medians, 0.9))
+    return medians

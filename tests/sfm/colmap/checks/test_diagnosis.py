@@ -4,7 +4,8 @@ import itertools
 
 import pytest
 
-from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
+from snowsplat.sfm.colmap.checks import diagnosis
+from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.sfm.colmap.database import VerifiedPair
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.messages import Message
@@ -68,3 +69,16 @@ def test_more_effort_is_useless_without_overlap_or_motion():
     assert not Evidence([2000] * 5, all_pairs(5), 0.1, 10).more_effort_is_useless
     assert Evidence([2000] * 5, all_pairs(5), 0.001, 10).more_effort_is_useless
     assert Evidence([2000] * 5, all_pairs(5, flat=True), 0.1, 10).more_effort_is_useless
+
+
+def test_brackets_from_one_place_do_not_say_that_the_scene_is_flat(monkeypatch, tmp_path):
+    """Three exposures at a place: 3 pairs without motion, 9 with depth."""
+    pairs = [VerifiedPair(i, j, 900, flat=True) for i, j in ((1, 2), (1, 3), (2, 3))]
+    pairs += [VerifiedPair(i, j, 60) for i, j in itertools.product((1, 2, 3), (4, 5, 6))]
+    monkeypatch.setattr(diagnosis, "verified_pairs", lambda _: pairs)
+    monkeypatch.setattr(diagnosis, "feature_counts", lambda *_: [2000] * 6)
+    monkeypatch.setattr(
+        diagnosis, "displacements_of", lambda _, some, still: [100.0 * (not p.flat) for p in some]
+    )
+    evidence = gather_evidence(tmp_path, photos(6), 15)
+    assert not evidence.flat

@@ -4,10 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from snowsplat.sfm.colmap.database import (
     MIN_MATCHES,
     VerifiedPair,
-    displacement_of,
+    displacements_of,
     feature_counts,
     verified_pairs,
 )
@@ -37,6 +39,9 @@ class Evidence:
     # there are no matches.
     displacement: float | None
     matched: int  # number of pairs that were matched, with or without success
+    # About 100 of the pairs, without those from one place, which fit a rotation in any scene; None:
+    # all pairs.
+    moving: list[VerifiedPair] | None = None
 
     @property
     def matched_all(self) -> bool:
@@ -63,8 +68,9 @@ class Evidence:
     @property
     def flat(self) -> bool:
         """Whether one plane, or a pure rotation of the camera, explains most matches."""
-        flat = sum(pair.matches for pair in self.pairs if pair.flat)
-        return flat > 0 and flat >= _FLAT_SHARE * sum(pair.matches for pair in self.pairs)
+        pairs = self.pairs if self.moving is None else self.moving
+        flat = sum(pair.matches for pair in pairs if pair.flat)
+        return flat > 0 and flat >= _FLAT_SHARE * sum(pair.matches for pair in pairs)
 
     @property
     def still(self) -> bool:
@@ -83,8 +89,12 @@ def gather_evidence(database: Path, photos: Sequence[Photo], matched: int) -> Ev
     size = max(max(photo.width, photo.height) for photo in photos)
     # About 100 evenly chosen pairs are enough.
     some = pairs[:: max(1, len(pairs) // 100)]
-    displacement = displacement_of(database, some, _STILL * size) / size if some else None
-    return Evidence(feature_counts(database, len(photos)), pairs, displacement, matched)
+    moved = np.array(displacements_of(database, some, _STILL * size)) / size
+    # A lower quantile would be nearly zero in a slow video, where the frames of many pairs are
+    # nearly equal.
+    displacement = float(np.quantile(moved, 0.9)) if some else None
+    moving = [pair for pair, far in zip(some, moved >= _STILL, strict=True) if far]
+    return Evidence(feature_counts(database, len(photos)), pairs, displacement, matched, moving)
 
 
 def explain(
