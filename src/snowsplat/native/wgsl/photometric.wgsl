@@ -32,7 +32,13 @@ struct Params {
 
 const kEdge = 16u;
 const kRadius = 5u;
-const kTaps = 11u;
+// The window, from its centre on; it is symmetric. A loop over an array of them would be slower.
+const kTap0 = 0.26601172486179436;
+const kTap1 = 0.2130055377112537;
+const kTap2 = 0.10936068950970002;
+const kTap3 = 0.03600077212843083;
+const kTap4 = 0.007598758135239185;
+const kTap5 = 0.00102838008447911;
 const kWide = 26u;               // kEdge + 2 kRadius
 const kWideCount = 676u;         // kWide²
 const kRows = 416u;              // kWide · kEdge
@@ -42,18 +48,6 @@ const kHuberDelta = 0.1;
 
 var<workgroup> wide: array<f32, 2028>;      // 3 kWideCount
 var<workgroup> filtered: array<f32, 1664>;  // 4 kRows
-
-fn tap(k: u32) -> f32 {
-  let x = select(k - kRadius, kRadius - k, k < kRadius);
-  switch (x) {
-    case 0u: { return 0.26601172486179436; }
-    case 1u: { return 0.2130055377112537; }
-    case 2u: { return 0.10936068950970002; }
-    case 3u: { return 0.03600077212843083; }
-    case 4u: { return 0.007598758135239185; }
-    default: { return 0.00102838008447911; }
-  }
-}
 
 fn reference_at(i: u32) -> f32 {
   if (params.bytes == 0u) { return bitcast<f32>(reference[i]); }
@@ -84,11 +78,22 @@ fn wide_pixel(tile: Tile, i: u32) -> i32 {
 
 // The column filter of a map at the pixel of a thread.
 fn down(map: u32, thread: u32) -> f32 {
-  var sum = 0.0;
-  for (var k = 0u; k < kTaps; k++) {
-    sum += tap(k) * filtered[map * kRows + (thread / kEdge + k) * kEdge + thread % kEdge];
-  }
-  return sum;
+  let at = map * kRows + thread;  // of the first of 11 rows of 16 pixels
+  return kTap5 * (filtered[at] + filtered[at + 160u]) + kTap4 * (filtered[at + 16u] + filtered[at + 144u]) +
+         kTap3 * (filtered[at + 32u] + filtered[at + 128u]) +
+         kTap2 * (filtered[at + 48u] + filtered[at + 112u]) +
+         kTap1 * (filtered[at + 64u] + filtered[at + 96u]) + kTap0 * filtered[at + 80u];
+}
+
+// a, b, a² + b² and ab at a pixel of the tile with its margin.
+fn products(at: u32) -> vec4<f32> {
+  let a = wide[at];
+  let b = wide[kWideCount + at];
+  return vec4<f32>(a, b, a * a + b * b, a * b);
+}
+
+fn derivatives(at: u32) -> vec3<f32> {
+  return vec3<f32>(wide[at], wide[kWideCount + at], wide[2u * kWideCount + at]);
 }
 
 @compute @workgroup_size(256)
@@ -112,13 +117,10 @@ fn photometric_similarity(@builtin(workgroup_id) group: vec3<u32>,
   }
   workgroupBarrier();
   for (var i = thread; i < kRows; i += 256u) {
-    var sum = vec4<f32>(0.0);
-    for (var k = 0u; k < kTaps; k++) {
-      let at = i / kEdge * kWide + i % kEdge + k;
-      let a = wide[at];
-      let b = wide[kWideCount + at];
-      sum += tap(k) * vec4<f32>(a, b, a * a + b * b, a * b);
-    }
+    let at = i / kEdge * kWide + i % kEdge;
+    let sum = kTap5 * (products(at) + products(at + 10u)) + kTap4 * (products(at + 1u) + products(at + 9u)) +
+              kTap3 * (products(at + 2u) + products(at + 8u)) + kTap2 * (products(at + 3u) + products(at + 7u)) +
+              kTap1 * (products(at + 4u) + products(at + 6u)) + kTap0 * products(at + 5u);
     for (var map = 0u; map < 4u; map++) { filtered[map * kRows + i] = sum[map]; }
   }
   workgroupBarrier();
@@ -154,20 +156,24 @@ fn photometric_similarity(@builtin(workgroup_id) group: vec3<u32>,
   workgroupBarrier();
   for (var k = 0u; k < 3u; k++) { wide[256u * k + thread] = found[k]; }
   workgroupBarrier();
-  add_halves(thread);
-  if (thread < 3u) { sums[3u * tile.index + thread] = wide[256u * thread]; }
+  let sum = sum_of_list(thread);
+  if (thread < 3u) { sums[3u * tile.index + thread] = sum; }
 }
 
-// The sums of three lists of 256 numbers in `wide`, to the first number of each.
-fn add_halves(thread: u32) {
-  for (var half = 128u; half > 0u; half /= 2u) {
-    if (thread < half) {
-      for (var k = 0u; k < 3u; k++) {
-        wide[256u * k + thread] += wide[256u * k + thread + half];
-      }
-    }
-    workgroupBarrier();
+// The sum of list `thread` of three lists of 256 numbers in `wide`, for thread 0 to 2. In two steps,
+// because a barrier takes long on drivers that compute on the CPU.
+fn sum_of_list(thread: u32) -> f32 {
+  if (thread < 48u) {
+    var part = 0.0;
+    for (var i = 0u; i < 16u; i++) { part += wide[16u * thread + i]; }
+    wide[768u + thread] = part;
   }
+  workgroupBarrier();
+  var sum = 0.0;
+  if (thread < 3u) {
+    for (var i = 0u; i < 16u; i++) { sum += wide[768u + 16u * thread + i]; }
+  }
+  return sum;
 }
 
 @compute @workgroup_size(256)
@@ -190,11 +196,10 @@ fn photometric_gradient(@builtin(workgroup_id) group: vec3<u32>,
   }
   workgroupBarrier();
   for (var i = thread; i < kRows; i += 256u) {
-    var sum = vec3<f32>(0.0);
-    for (var k = 0u; k < kTaps; k++) {
-      let at = i / kEdge * kWide + i % kEdge + k;
-      sum += tap(k) * vec3<f32>(wide[at], wide[kWideCount + at], wide[2u * kWideCount + at]);
-    }
+    let at = i / kEdge * kWide + i % kEdge;
+    let sum = kTap5 * (derivatives(at) + derivatives(at + 10u)) + kTap4 * (derivatives(at + 1u) + derivatives(at + 9u)) +
+              kTap3 * (derivatives(at + 2u) + derivatives(at + 8u)) + kTap2 * (derivatives(at + 3u) + derivatives(at + 7u)) +
+              kTap1 * (derivatives(at + 4u) + derivatives(at + 6u)) + kTap0 * derivatives(at + 5u);
     for (var map = 0u; map < 3u; map++) { filtered[map * kRows + i] = sum[map]; }
   }
   workgroupBarrier();
@@ -218,10 +223,10 @@ fn photometric_means(@builtin(local_invocation_index) thread: u32) {
     wide[256u * k + thread] = sum;
   }
   workgroupBarrier();
-  add_halves(thread);
+  let total = sum_of_list(thread);
   if (thread < 3u) {
     // The bits of a float64.
-    let bits = bitcast<u32>(wide[256u * thread] / params.values);
+    let bits = bitcast<u32>(total / params.values);
     let exponent = (bits >> 23u) & 255u;
     let fraction = bits & 0x7fffffu;
     let high = select(exponent + 896u, 2047u, exponent == 255u) << 20u;
