@@ -139,26 +139,28 @@ def test_a_step_is_that_of_the_cpu(made, dataset):
     )
     read = load_dataset(dataset)
     camera = read.train[1].camera
-    degree = (found["step"] - 1) // 1000
+    data = json.loads(re.search(r'id="data">(.*?)</script>', made.page.read_text("utf-8"))[1])
+    recipe = data["recipe"]
+    degree = (found["step"] - 1) // recipe["degreeEvery"]
     names = ("cam_from_world", "width", "height", "fx", "fy", "cx", "cy")
     view = ops.View(*(getattr(camera, name) for name in names), degree, camera.near)
     gaussians = SimpleNamespace(**before.values)
     splats = ops.project(gaussians, view)
     splats.packed.requires_grad_().retain_grad()
     image, _, _ = ops.rasterize(splats, view.width, view.height)
-    data = json.loads(re.search(r'id="data">(.*?)</script>', made.page.read_text("utf-8"))[1])
     photo = np.asarray(Image.open(io.BytesIO(base64.b64decode(data["views"][1]["jpeg"]))))
     loss = ops.photometric_loss(image, torch.from_numpy(photo.copy()))
     loss.backward()
     share = found["step"] / 20
-    means = read.extent * 1.6e-4 ** (1 - share) * 1.6e-6**share
-    rates = dict(zip(PARAMETERS, (means, 5e-3, 1e-3, 0.05, 2.5e-3, 1.25e-4), strict=True))
+    first, last = recipe["means"]
+    rates = {"means": read.extent * first ** (1 - share) * last**share} | recipe["rates"]
     ops.adam_step(
         gaussians,
         ops.Moments(before.m, before.v),
         ops.SplatGradient.of(splats),
         view,
         ops.AdamRates(rates, found["step"]),
+        visible_only=recipe["visibleOnly"],
     )
     assert found["loss"] == pytest.approx(loss.item(), rel=2e-3)  # decoders of JPEG differ
     for name in PARAMETERS:

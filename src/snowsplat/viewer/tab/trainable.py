@@ -14,7 +14,7 @@ import json
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.render import to_8bit
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.density import AdaptiveDensity
+from snowsplat.training.settings.recipes import changed, recipe
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.starts.init import initial_gaussians
 from snowsplat.trajectory.focus import focus_of, up_of, viewing_distance
 from snowsplat.util.files import write_text
@@ -100,13 +102,14 @@ def write_trainable(
         masked += loaded.mask is not None
         photos.append(_photo(view, loaded.over(torch.zeros(3)), len(photos) >= len(dataset.train)))
         progress(len(photos), len(views))
-    config = TrainConfig(density=AdaptiveDensity(max_gaussians=_MOST_GAUSSIANS))
+    config = changed(recipe("classic"), iterations=steps)
+    first = replace(config, density=AdaptiveDensity(max_gaussians=_MOST_GAUSSIANS))
     generator = torch.Generator().manual_seed(0)
-    gaussians = initial_gaussians(dataset, config, images, generator, torch.device("cpu"))
+    gaussians = initial_gaussians(dataset, first, images, generator, torch.device("cpu"))
     opacity = config.initial_opacity
     data = {
         "file": path.stem,
-        "steps": steps,
+        "recipe": _recipe(config),
         "near": views[0].camera.near,
         "logit": math.log(opacity / (1 - opacity)),
         "scene": _scene(dataset, views),
@@ -146,6 +149,28 @@ def page(title: str, data: dict[str, Any]) -> str:
     }
     template = (_PAGE / "index.html").read_text("utf-8")
     return re.sub(r"\{(\w+)\}", lambda found: parts[found[1]], template)
+
+
+def _recipe(config: TrainConfig) -> dict[str, Any]:
+    """What the page needs of the settings; moments are steps."""
+    rates, density = config.learning_rates, config.density
+    schedule = Schedule(config.iterations)
+    assert isinstance(density, AdaptiveDensity)
+    names = ("log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
+    quarter, half = (schedule.step_of(moment) for moment in config.coarse_to_fine)
+    return {
+        "steps": config.iterations,
+        "means": [rates.means, rates.means_final],
+        "rates": {name: getattr(rates, name) for name in names},
+        "degreeEvery": config.sh_interval,
+        "refineEvery": density.densify_interval,
+        "refineFrom": schedule.step_of(density.densify_from),
+        "refineUntil": schedule.step_of(density.densify_until),
+        "most": density.max_gaussians,
+        "smaller": [[4, quarter], [2, half]],
+        "ssim": config.ssim_weight,
+        "visibleOnly": config.visible_only,
+    }
 
 
 def _photo(view: View, image: Tensor, held_out: bool) -> dict[str, Any]:

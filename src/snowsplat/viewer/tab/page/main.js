@@ -204,7 +204,7 @@ const start = async () => {
     await gpu.prepare(OPERATIONS, (number, kernels) => {
         byId("notice").textContent = say("preparing", { number, kernels });
     });
-    const page = new Page(new Trainer(gpu, firstGaussians(), photos, data.scene.extent, data.steps));
+    const page = new Page(new Trainer(gpu, firstGaussians(), photos, data.scene.extent, data.recipe));
     Object.assign(window, { snowsplat: page }); // for the console of the browser
     listen(byId("stage"), {
         camera: () => page.camera,

@@ -8,20 +8,23 @@ import { PARAMETERS, Renderer, STRIDE } from "./renderer.js";
 /** @typedef {Record<string, Buffer>} Buffers by parameter */
 /** A photo: `pixels` are planar bytes. @typedef {import('./renderer.js').View & {pixels: Uint8Array, heldOut: boolean}} Photo */
 
+/**
+ * Settings of the training, as in `training/settings`; moments are steps.
+ * @typedef {object} Recipe
+ * @property {number} steps
+ * @property {[number, number]} means first and last rate of the positions, in units of the extent
+ * @property {Record<string, number>} rates of the other parameters
+ * @property {number} degreeEvery steps between degrees of the spherical harmonics
+ * @property {number} refineEvery
+ * @property {number} refineFrom
+ * @property {number} refineUntil
+ * @property {number} most Gaussians
+ * @property {[number, number][]} smaller factors of the photos, and the moments until which they are used
+ * @property {number} ssim weight of 1 − SSIM in the loss
+ * @property {boolean} visibleOnly
+ */
+
 const [BETA1, BETA2, EPS] = [0.9, 0.999, 1e-15];
-const RATES = /** @type {Record<string, number>} */ ({
-    ...{ log_scales: 5e-3, quats: 1e-3, opacity_logits: 0.05, sh_dc: 2.5e-3, sh_rest: 1.25e-4 },
-});
-const [MEANS_FIRST, MEANS_LAST] = [1.6e-4, 1.6e-6]; // of the extent
-const SSIM = 0.2; // weight of 1 − SSIM in the loss
-const [REFINE_EVERY, REFINE_UNTIL] = [100, 0.6]; // steps; of all steps
-const REFINE_FROM = 0.1;
-const DEGREE_EVERY = 1000; // steps
-// The photos are smaller at first: factor, share of the steps until which it is used.
-const SMALLER = [
-    [4, 0.1],
-    [2, 0.3],
-];
 const SMALLEST = 64; // pixels of the longer side of a smaller photo, at least
 /** The operations of a step. */
 export const OPERATIONS = [
@@ -29,7 +32,6 @@ export const OPERATIONS = [
     ...["photometric", "photometric_means", "rasterize_bwd", "splats_reduce", "accumulate_screen_statistics"],
     ...["project_rows", "adam_update"],
 ];
-const MOST = 200_000; // Gaussians
 const REPORT = 32; // bytes for each step: the instances, and three means of the loss
 const MOST_STEPS = 64; // between two reports
 
@@ -65,12 +67,13 @@ export class Trainer {
      * @param {Arrays} values the first Gaussians
      * @param {Photo[]} photos
      * @param {number} extent
-     * @param {number} steps
+     * @param {Recipe} recipe
      */
-    constructor(gpu, values, photos, extent, steps) {
+    constructor(gpu, values, photos, extent, recipe) {
         this.gpu = gpu;
         this.extent = extent;
-        this.steps = steps;
+        this.recipe = recipe;
+        this.steps = recipe.steps;
         this.renderer = new Renderer(gpu);
         this.training = photos.filter(photo => !photo.heldOut);
         this.heldOut = photos.filter(photo => photo.heldOut);
@@ -105,7 +108,7 @@ export class Trainer {
     }
 
     get gaussians() {
-        const degree = Math.min(3, Math.floor(this.step / DEGREE_EVERY));
+        const degree = Math.min(3, Math.floor(this.step / this.recipe.degreeEvery));
         return { count: this.count, degree, buffers: this.sets[0] };
     }
 
@@ -115,7 +118,11 @@ export class Trainer {
 
     /** Steps until the Gaussians have to be refined, or the end. */
     get ahead() {
-        return Math.min(REFINE_EVERY - (this.step % REFINE_EVERY), this.steps - this.step, MOST_STEPS);
+        return Math.min(
+            this.recipe.refineEvery - (this.step % this.recipe.refineEvery),
+            this.steps - this.step,
+            MOST_STEPS,
+        );
     }
 
     /** Train for some steps, at most `ahead`, and refine the Gaussians if it is time. @param {number} steps */
@@ -129,17 +136,17 @@ export class Trainer {
             // A step for which the memory did not suffice has changed nothing.
             if (renderer.outgrew(new Uint32Array(told, REPORT * k, 1)[0], capacity)) continue;
             const [l1, similarity] = new Float64Array(told, REPORT * k + 8, 2);
-            losses.push((1 - SSIM) * l1 + SSIM * (1 - similarity));
+            losses.push((1 - this.recipe.ssim) * l1 + this.recipe.ssim * (1 - similarity));
         }
         if (losses.length) this.loss = losses.reduce((sum, each) => sum + each, 0) / losses.length;
-        const share = this.step / this.steps;
-        if (this.step % REFINE_EVERY === 0 && share >= REFINE_FROM && share <= REFINE_UNTIL) await this.refine();
+        const { refineEvery, refineFrom, refineUntil } = this.recipe;
+        if (this.step % refineEvery === 0 && this.step >= refineFrom && this.step <= refineUntil) await this.refine();
     }
 
     /** A photo in the size that the step needs. @param {Photo} photo */
     sized(photo) {
         const fits = (/** @type {number} */ factor) => Math.max(photo.width, photo.height) >= SMALLEST * factor;
-        const [factor] = SMALLER.find(([by, until]) => this.step < until * this.steps && fits(by)) ?? [1];
+        const [factor] = this.recipe.smaller.find(([by, until]) => this.step < until && fits(by)) ?? [1];
         const known = this.reduced.get(photo);
         if (factor === 1) this.reduced.delete(photo);
         if (factor === 1 || known?.factor === factor) return known && factor > 1 ? known.photo : photo;
@@ -173,7 +180,7 @@ export class Trainer {
         const values = 3 * width * height;
         const loss = {
             ...{ n: 3, first: 0, width, height, tiles, bytes: 1, values, parts: 3 * tiles },
-            ...{ l1_weight: (1 - SSIM) / values, ssim_weight: -SSIM / values, huber_weight: 0 },
+            ...{ l1_weight: (1 - this.recipe.ssim) / values, ssim_weight: -this.recipe.ssim / values, huber_weight: 0 },
             ...{ image: frame.image, target, grad, means },
             maps: gpu.temporary("maps", 36 * width * height),
             sums: gpu.temporary("sums", 36 * tiles),
@@ -203,8 +210,9 @@ export class Trainer {
         const rows = { first: 0, count: this.count, width, rows: gpu.temporary("rows", 4 * width * this.count) };
         gpu.follow("project_rows", { ...frame, ...rows });
         const share = Math.min(1, step / this.steps);
-        const means = this.extent * MEANS_FIRST ** (1 - share) * MEANS_LAST ** share;
-        const rates = /** @type {Record<string, number>} */ ({ ...RATES, means });
+        const [first, last] = this.recipe.means;
+        const means = this.extent * first ** (1 - share) * last ** share;
+        const rates = /** @type {Record<string, number>} */ ({ ...this.recipe.rates, means });
         const parameters = Object.keys(PARAMETERS).flatMap(name => [
             ...["value", "m", "v"].map((part, k) => [`${name}_${part}`, this.sets[k][name]]),
             [`${name}_rate`, rates[name] / (1 - BETA1 ** step)],
@@ -218,7 +226,7 @@ export class Trainer {
             inv_correction2: 1 / (1 - BETA2 ** step),
             sh_columns: width - 14,
             sh_stride: PARAMETERS.sh_rest,
-            visible_only: 0,
+            visible_only: Number(this.recipe.visibleOnly),
             valid,
         });
     }
@@ -242,7 +250,7 @@ export class Trainer {
             each => new Float32Array(each),
         );
         const gradients = sums.map((sum, i) => sum / Math.max(1, views[i]));
-        this.load(refined(await this.state(), gradients, this.extent, MOST, this.random));
+        this.load(refined(await this.state(), gradients, this.extent, this.recipe.most, this.random));
     }
 
     /** The PSNR of the photos that are held out, or of some of the others, in dB. */
