@@ -41,7 +41,7 @@ NO_BIOME := lint: JavaScript is not checked; that needs Node, and npm ci --prefi
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
 .PHONY: demo quick test nightly dev docs gallery messages format native wheel compiler lint types layers clean
-.PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized neon
+.PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized neon webgpu
 
 demo: native $(ENVIRONMENT)
 	$(PYTHON) -m snowsplat demo -o out/demo
@@ -144,7 +144,7 @@ PYTEST = $(PROCESS) $(PYTHON) -m pytest $(PROCESSES)
 PROCESS = $(if $(filter 1,$(JOBS)),OMP_NUM_THREADS=1)
 PROCESSES = $(if $(filter 1,$(JOBS)),,-n $(JOBS) --dist worksteal)
 # Slow tests have a mark, and `quick` excludes these marks (listed in pyproject.toml).
-QUICK := not (sfm or browser or build or emulated or gpu or kill or slow or nightly)
+QUICK := not (sfm or browser or build or emulated or gpu or webgpu or kill or slow or nightly)
 ISA := isa and not (emulated or gpu or nightly)
 # The tests of kernels that other instruction sets do not repeat: threads and the loops over long images
 # are the same for each of them; and on each, results and gradients are compared with those of the reference,
@@ -168,7 +168,7 @@ pytest: native $(ENVIRONMENT)
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
 
 pytest-best:
-	$(PYTEST) -m 'not nightly' $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
+	$(PYTEST) -m 'not (nightly or webgpu)' $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
 nightly: native $(ENVIRONMENT)
 	@$(MAKE) --no-print-directory pytest-isas CASES=all ISA_SKIPPED='$(SAME)'
@@ -190,10 +190,15 @@ neon: native $(ENVIRONMENT)
 	    SNOWSPLAT_CASES=$(CASES) SNOWSPLAT_NEON=run $(PYTEST) -m '$(ISA)' $(NEON_TESTS), \
 	    echo "neon: skipped; it needs a compiler and an emulator (Debian/Ubuntu: apt install g++-aarch64-linux-gnu qemu-user)")
 
+# The kernels in WGSL, in processes of their own (tests/conftest.py says why).
+webgpu: native $(ENVIRONMENT)
+	@echo "webgpu: $(PYTEST) -m 'webgpu and not nightly' tests/ops tests/training"
+	@$(PYTEST) -m 'webgpu and not nightly' tests/ops tests/training
+
 # Prints everything if a test fails, otherwise only the numbers of tests.
 pytest-repeated:
-	@if nice -n 5 $(MAKE) --no-print-directory pytest-isas sanitized neon LOWER='[-2:-1]' JOBS=$$(($(JOBS) / 2)) >$(REPEATED) 2>&1; \
-	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|neon|[0-9]+ passed)' $(REPEATED); \
+	@if nice -n 5 $(MAKE) --no-print-directory pytest-isas sanitized neon webgpu LOWER='[-2:-1]' JOBS=$$(($(JOBS) / 2)) >$(REPEATED) 2>&1; \
+	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|neon|webgpu|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
 # With the precision that trainings use: float64, for references, has the same source. Random values are

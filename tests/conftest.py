@@ -61,7 +61,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(_OF_FIXTURES[fixture])
     # The tests of a page share a browser and a training run. At the end of the tests, a second
     # process would take over some of them.
-    items.sort(key=lambda item: "browser" not in {mark.name for mark in item.iter_markers()})
+    # The driver that computes WebGPU on the CPU contains LLVM, and so does a part of torch: after a
+    # test on webgpu, a process cannot load the other one.
+    marks = {item: {mark.name for mark in item.iter_markers()} for item in items}
+    items.sort(key=lambda item: ("webgpu" in marks[item], "browser" not in marks[item]))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -74,7 +77,12 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish(session: pytest.Session) -> None:
+    if any(item.get_closest_marker("webgpu") for item in session.items):
+        from snowsplat.ops.webgpu import backend
+
+        if backend.why_unsupported() is None:
+            backend.enable()  # before the first backward pass
     # Each training run calls gc.collect(), which need not examine the loaded modules and all tests.
     gc.collect()
     gc.freeze()

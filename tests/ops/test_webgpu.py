@@ -2,6 +2,8 @@
 tests of this folder."""
 
 import copy
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -124,3 +126,12 @@ def test_float64_is_refused(device: torch.device) -> None:
     points = torch.zeros(2, 3, dtype=torch.float64, device=device)
     with pytest.raises(UserError, match="webgpu has no kernels for points_in_spheres_f64"):
         ops.points_in_spheres(points, torch.zeros(1, 4, dtype=torch.float64, device=device))
+
+
+def test_gradients_that_were_computed_before_are_refused_in_one_line(device: torch.device) -> None:
+    script = (
+        "import torch; torch.ones(1, requires_grad=True).backward()\n"
+        "from snowsplat import ops; ops.resolve_device('webgpu')"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert "UserError: webgpu: torch has computed gradients" in run.stderr

@@ -60,7 +60,25 @@ def _enabled() -> torch.device:
         func = getattr(getattr(torch.ops.aten, packet), overload or "default")
         aten.impl(name, functools.partial(_on_cpu, func), key)
     _libraries.extend((aten, every))
-    return torch.device(tensors.DEVICE, 0)
+    device = torch.device(tensors.DEVICE, 0)
+    _check_gradients(device)
+    return device
+
+
+def _check_gradients(device: torch.device) -> None:
+    """Torch has a queue of gradients for each device that it knows at the first backward pass.
+
+    Raises: UserError: that was before the device was known.
+    """
+    one = torch.zeros(1, device=device).requires_grad_()
+    try:
+        with torch.enable_grad():
+            one.view(1).backward()
+    except RuntimeError:
+        raise UserError(
+            "webgpu: torch has computed gradients before it knew the device; start a new process, "
+            'and call snowsplat.ops.resolve_device("webgpu") first'
+        ) from None
 
 
 #: Registrations end when these objects are deleted.

@@ -7,8 +7,10 @@ needs one transfer, and none of them can see an old value.
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections import defaultdict
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -88,8 +90,8 @@ class Memory:
         # Which copies are up to date. New memory has no content, so both are.
         self._on_host, self._on_device = True, host is None
 
-    def __del__(self) -> None:
-        if self._buffer is not None:
+    def __del__(self, ends: Callable[[], bool] = sys.is_finalizing) -> None:
+        if self._buffer is not None and not ends():  # at the end of Python, modules are empty
             _pool.give(self._buffer)
 
     def __deepcopy__(self, memo: Any) -> Memory:
