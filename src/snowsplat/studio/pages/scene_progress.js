@@ -130,9 +130,9 @@ function showNow(/** @type {HTMLElement} */ element, /** @type {import("./types.
         : [now.done ?? 0, now.total, now.left];
     const name = say(`stage_${now.stage}`);
     const what = training ? say("step").toLowerCase() : told(now.what ?? "");
-    const number = total ? ` ${say("of", count.toLocaleString(), total.toLocaleString())}` : "";
+    const number = total ? say("of", count.toLocaleString(), total.toLocaleString()) : count || "";
     element.replaceChildren(
-        make("p", {}, make("b", {}, name), make("span.soft", {}, ` ${what}${number}`)),
+        make("p", {}, make("b", {}, name), make("span.soft", {}, ` ${what} ${number}`)),
         make("progress", { ...(total ? { max: total, value: count } : {}), "aria-label": name }),
         make("p.soft", {}, left ? say("left", duration(left)) : ""),
     );
