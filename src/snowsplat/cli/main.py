@@ -113,7 +113,7 @@ def parse(arguments: Sequence[str]) -> Command:
     from snowsplat.cli import parser
 
     # Importing and analysing all of them takes longer than everything else that a help text needs.
-    # Only completion scripts and suggestions for a misplaced flag need the flags of all.
+    # Only completion scripts need the flags of all.
     commands = {
         each: load_subcommand(each) if each == name or name.startswith("-") else None
         for each in SUBCOMMANDS

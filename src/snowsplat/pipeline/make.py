@@ -238,16 +238,18 @@ class _Job:
         settings: dict[str, Any],
         outputs: list[Path],
         work: Callable[[], dict[str, Any]],
+        seconds: float = 0.0,
     ) -> dict[str, Any]:
-        """The result of a stage, which is executed unless it is finished."""
+        """The result of a stage, which is executed unless it is finished.
+
+        ``seconds``: the predicted time until the end of the job; 0: not known.
+        """
 
         def on_change(reason: str) -> None:
             self.observer.inform("{name}: repeated ({reason})", name=name, reason=reason)
 
         def photo_is_prepared() -> None:
-            left = None
-            if name == "scene" and self._training_seconds:
-                left = max(1.0, self._training_seconds - (time.monotonic() - began))
+            left = max(1.0, seconds - (time.monotonic() - began)) if seconds else None
             report(next(count), 0, "prepared photos", left)
 
         report, count, began = self.observer.begin(name), itertools.count(1), time.monotonic()
@@ -331,7 +333,13 @@ class _Job:
             settings["import"] = files
         folder = self.folder
         outputs = [self.file, folder.point_clouds, folder.metrics]
-        result = self._stage("scene", settings, outputs, lambda: self._train(settings, plan))
+        result = self._stage(
+            "scene",
+            settings,
+            outputs,
+            lambda: self._train(settings, plan),
+            self._training_seconds,
+        )
         figures = from_json(Figures, result)
         shutil.rmtree(folder.checkpoints, ignore_errors=True)  # no longer needed
         if not figures.views:

@@ -34,14 +34,18 @@ def why_unsupported() -> str | None:
 def enable() -> torch.device:
     """Make the device known to torch, if it is not yet, and return it.
 
-    Raises: UserError: this torch cannot have it, or another package has registered a device.
+    Raises:
+        UserError: this torch cannot have it, another package has registered a device, or torch has
+            computed gradients before.
     """
     with _lock:
-        return _enabled()
+        device = _registered()
+        _check_gradients(device)
+        return device
 
 
 @functools.cache
-def _enabled() -> torch.device:
+def _registered() -> torch.device:
     why = why_unsupported()
     if why is not None:
         raise UserError("webgpu: {why}", why=why)
@@ -60,9 +64,7 @@ def _enabled() -> torch.device:
         func = getattr(getattr(torch.ops.aten, packet), overload or "default")
         aten.impl(name, functools.partial(_on_cpu, func), key)
     _libraries.extend((aten, every))
-    device = torch.device(tensors.DEVICE, 0)
-    _check_gradients(device)
-    return device
+    return torch.device(tensors.DEVICE, 0)
 
 
 def _check_gradients(device: torch.device) -> None:

@@ -8,7 +8,7 @@ import torch
 
 from snowsplat.ops.webgpu import tensor as tensors
 from snowsplat.ops.webgpu.adapter import gpu
-from snowsplat.ops.webgpu.kernels import is_whole, run_text
+from snowsplat.ops.webgpu.kernels import run_text
 from snowsplat.ops.webgpu.tensor import DEVICE, KERNELS, DeviceTensor
 
 _SMALL = 1 << 14  # bytes of a tensor that the CPU processes as fast
@@ -43,12 +43,16 @@ fn combine(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gro
 """
 
 
+def _is_whole(tensor: Any) -> bool:
+    """Whether a kernel can process all elements of a tensor, in the order of its memory."""
+    return isinstance(tensor, DeviceTensor) and tensor.is_contiguous()
+
+
 def _is_large(tensor: Any) -> bool:
     """Whether a float32 tensor is on the device, contiguous, and too large for the CPU."""
     return (
-        isinstance(tensor, DeviceTensor)
+        _is_whole(tensor)
         and tensor.dtype == torch.float32
-        and tensor.is_contiguous()
         and tensor.numel() * 4 > _SMALL
         and tensor.memory.is_on_device
     )
@@ -97,7 +101,7 @@ def _combined(first: Any, other: Any, alpha: Any, product: bool) -> Any:
         return NotImplemented
     if isinstance(other, (int, float)):
         other = torch.full((1,), float(other), device=first.device)
-    if not (is_whole(other) and other.dtype == torch.float32):
+    if not (_is_whole(other) and other.dtype == torch.float32):
         return NotImplemented
     if other.shape != first.shape and other.numel() != 1:
         return NotImplemented
@@ -110,7 +114,7 @@ def _combined(first: Any, other: Any, alpha: Any, product: bool) -> Any:
 
 def _copied(target: Any, source: Any, non_blocking: bool = False) -> Any:
     """`copy_` between contiguous tensors on the device."""
-    if not (_is_large(source) and is_whole(target) and target.dtype == source.dtype):
+    if not (_is_large(source) and _is_whole(target) and target.dtype == source.dtype):
         return NotImplemented
     if target.shape != source.shape or target.memory is source.memory:
         return NotImplemented

@@ -7,8 +7,6 @@ import struct
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import torch
-
 from snowsplat.ops.webgpu.adapter import ALIGNMENT, STORAGE_BUFFERS, gpu
 from snowsplat.ops.webgpu.memory import Memory
 from snowsplat.ops.webgpu.shaders import Shader, read, shader
@@ -164,13 +162,3 @@ def _compiled(module: Any, code: Shader, entry: str) -> Any:
     return gpu().device.create_compute_pipeline(
         layout="auto", compute={"module": module, "entry_point": entry}
     )
-
-
-def is_whole(tensor: Any) -> bool:
-    """Whether a kernel can process all elements of a tensor, in the order of its memory."""
-    return isinstance(tensor, DeviceTensor) and tensor.is_contiguous()
-
-
-def empty(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-    """Memory on the device for a kernel."""
-    return torch.empty(shape, dtype=dtype, device="webgpu")

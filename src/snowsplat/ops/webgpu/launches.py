@@ -22,17 +22,16 @@ from typing import Any
 
 import torch
 
+from snowsplat.ops.gaussian_parameters import PARAMETERS
 from snowsplat.ops.webgpu.adapter import gpu
-from snowsplat.ops.webgpu.kernels import empty, run
+from snowsplat.ops.webgpu.kernels import run
 from snowsplat.ops.webgpu.shaders import FOLDER
-from snowsplat.ops.webgpu.tensor import DeviceTensor
+from snowsplat.ops.webgpu.tensor import DeviceTensor, empty
 from snowsplat.util import native_library
 from snowsplat.util.errors import UserError
-from snowsplat.util.native_layout import Fields
+from snowsplat.util.native_layout import TILE, Fields
 
-_PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 _PIECE = 1 << 18  # splats whose gradients are in memory at the same time
-_TILE = 16  # edge of a tile of `photometric` and `plane_sweep` in pixels
 _CHUNK = 32  # points of a chunk of `neighbours`; also chunks of a group
 _MAPS_BYTES = 64 << 20  # of the maps of derivatives, if at least one channel fits
 
@@ -73,7 +72,7 @@ def follow(name: str, fields: Fields, **more: Any) -> None:
     values = {field.replace(".", "_"): value for field, value in fields.items()} | more
     for scratch, needs in plan.get("scratch", {}).items():
         count = _count(needs, values) if "items" in needs else 1
-        values[scratch] = empty(max(4, count * needs["bytes"]), dtype=torch.uint8)
+        values[scratch] = empty(max(4, count * needs["bytes"]), torch.uint8)
     for step in plan["steps"]:
         if "needs" in step and not _is_given(values[step["needs"]]):
             continue
@@ -132,7 +131,7 @@ def _on_host(value: Any) -> Any:
 def _pieces(p: Fields, splats: int, sh_degree: int) -> Iterator[dict[str, Any]]:
     """Memory for the gradients of some of the splats, as fields of the kernels."""
     width = 11 + 3 * (sh_degree + 1) ** 2
-    rows = empty(min(splats, _PIECE), width)
+    rows = empty((min(splats, _PIECE), width), torch.float32)
     for first in range(0, splats, _PIECE):
         count = min(_PIECE, splats - first)
         yield {"n": count, "first": first, "rows": rows, "count": count, "width": width}
@@ -154,7 +153,7 @@ def _adam_step(p: Fields) -> int:
     if p["grad_packed"] is None or splats == 0:
         follow("adam_update", rule, first=0, rows=None, count=0, width=0)
         return 0
-    gaussians = {f"gaussians.{name}": p[f"{name}.value"] for name in _PARAMETERS}
+    gaussians = {f"gaussians.{name}": p[f"{name}.value"] for name in PARAMETERS}
     gaussians |= {f"gaussians.{name}": p[name] for name in ("sh_rest_rows", "sh_degree")}
     for piece in _pieces(p, splats, degree):
         follow("project_rows", {**p, **gaussians, **piece}, gaussians_sh_dc_rows=1)
@@ -164,14 +163,14 @@ def _adam_step(p: Fields) -> int:
 
 def _photometric(p: Fields, *, of_bytes: bool) -> int:
     channels, width, height, grad = p["n"], p["width"], p["height"], p["grad"]
-    tiles, values = -(-width // _TILE) * -(-height // _TILE), channels * width * height
-    sums = empty(channels * tiles, 3)
+    tiles, values = -(-width // TILE) * -(-height // TILE), channels * width * height
+    sums = empty((channels * tiles, 3), torch.float32)
     size = 12 * width * height  # bytes of the derivatives of a channel
     at_once = channels if grad is None else max(1, min(channels, _MAPS_BYTES // size))
     weights = {name: p[name] / values for name in ("l1_weight", "ssim_weight", "huber_weight")}
     parts = {"tiles": tiles, "parts": channels * tiles, "sums": sums, "values": values}
     fields = dict(p) | weights | parts | {"bytes": int(of_bytes)}
-    fields["maps"] = None if grad is None else empty(at_once * size // 4)
+    fields["maps"] = None if grad is None else empty(at_once * size // 4, torch.float32)
     for first in range(0, channels, at_once):
         follow("photometric", fields | {"n": min(at_once, channels - first)}, first=first)
     follow("photometric_means", fields)
@@ -187,7 +186,7 @@ def _add_noise(p: Fields) -> int:
 
 
 def _plane_sweep(p: Fields) -> int:
-    follow("plane_sweep", p, tiles=-(-p["width"] // _TILE) * -(-p["height"] // _TILE))
+    follow("plane_sweep", p, tiles=-(-p["width"] // TILE) * -(-p["height"] // TILE))
     return 0
 
 
@@ -198,7 +197,7 @@ def _neighbours(p: Fields) -> int:
     half_low, half_high = (0.5 * end for end in torch.aminmax(points, dim=0))
     box = dict(zip(("half_low_x", "half_low_y", "half_low_z"), half_low.tolist(), strict=True))
     box["half_extent"] = float((half_high - half_low).max())
-    codes, codes2, order, order2 = (empty(n, dtype=torch.int32) for _ in range(4))
+    codes, codes2, order, order2 = (empty(n, torch.int32) for _ in range(4))
     follow("neighbours_codes", p, codes=codes, **box)
     sort = {"n": n, "keys": codes, "keys2": codes2, "order": order, "order2": order2}
     follow("splats_sort", sort)

@@ -93,19 +93,19 @@ def write_trainable(
         OSError: the file cannot be written.
     """
     views = [*dataset.train, *dataset.test]
-    images = ImageLoader(views, background=(0.0, 0.0, 0.0))
-    images.prefetch(views)
     masked = 0
     photos: list[dict[str, Any]] = []
-    for view in views:
-        loaded = images.get(view)
-        masked += loaded.mask is not None
-        photos.append(_photo(view, loaded.over(torch.zeros(3)), len(photos) >= len(dataset.train)))
-        progress(len(photos), len(views))
     config = changed(recipe("classic"), iterations=steps)
     first = replace(config, density=AdaptiveDensity(max_gaussians=_MOST_GAUSSIANS))
     generator = torch.Generator().manual_seed(0)
-    gaussians = initial_gaussians(dataset, first, images, generator, torch.device("cpu"))
+    with ImageLoader(views, background=(0.0, 0.0, 0.0)) as images:
+        images.prefetch(views)
+        for index, view in enumerate(views):
+            loaded = images.get(view)
+            masked += loaded.mask is not None
+            photos.append(_photo(view, loaded.over(torch.zeros(3)), index >= len(dataset.train)))
+            progress(index + 1, len(views))
+        gaussians = initial_gaussians(dataset, first, images, generator, torch.device("cpu"))
     opacity = config.initial_opacity
     data = {
         "file": path.stem,
@@ -166,6 +166,9 @@ def _recipe(config: TrainConfig) -> dict[str, Any]:
         "refineEvery": density.densify_interval,
         "refineFrom": schedule.step_of(density.densify_from),
         "refineUntil": schedule.step_of(density.densify_until),
+        "threshold": density.grad_threshold,
+        "dense": density.percent_dense,
+        "least": density.prune_opacity,
         "most": density.max_gaussians,
         "smaller": [[4, quarter], [2, half]],
         "ssim": config.ssim_weight,

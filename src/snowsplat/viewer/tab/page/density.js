@@ -5,9 +5,6 @@ import { PARAMETERS } from "./renderer.js";
 /** @typedef {Record<string, Float32Array>} Arrays by parameter */
 /** @typedef {{count: number, values: Arrays, m: Arrays, v: Arrays}} State on the CPU */
 
-const THRESHOLD = 2e-4; // of the gradient, with the image spanning [-1, 1]
-const DENSE = 0.01; // of the extent: larger Gaussians are split
-const OPACITY = 0.005; // Gaussians with less are removed
 const SHRINK = 1.6; // of the scales in a split
 
 /** A number of the normal distribution. @param {() => number} random */
@@ -30,22 +27,28 @@ const offset = ({ log_scales, quats }, i, random) => {
  * @param {State} state
  * @param {ArrayLike<number>} gradients the mean norms
  * @param {number} extent of the scene
- * @param {number} most Gaussians
+ * @param {import('./trainer.js').Recipe} recipe
  * @param {() => number} random
  * @returns {State}
  */
-export const refined = ({ count, values, m, v }, gradients, extent, most, random) => {
+export const refined = (
+    { count, values, m, v },
+    gradients,
+    extent,
+    { threshold, dense: large, least, most },
+    random,
+) => {
     const size = (/** @type {number} */ i) =>
         Math.exp(Math.max(...values.log_scales.subarray(3 * i, 3 * i + 3))) / extent;
-    const logit = Math.log(OPACITY / (1 - OPACITY));
+    const logit = Math.log(least / (1 - least));
     const all = Array.from({ length: count }, (_, i) => i);
     let alive = all.filter(i => values.opacity_logits[i] >= logit);
     if (!alive.length) alive = all;
     const dense = alive
-        .filter(i => gradients[i] > THRESHOLD)
+        .filter(i => gradients[i] > threshold)
         .sort((i, j) => gradients[j] - gradients[i])
         .slice(0, Math.max(0, most - alive.length));
-    const split = new Set(dense.filter(i => size(i) > DENSE));
+    const split = new Set(dense.filter(i => size(i) > large));
     const kept = alive.filter(i => !split.has(i));
     const clones = dense.filter(i => !split.has(i));
     const index = [...kept, ...clones, ...split, ...split];

@@ -18,6 +18,9 @@ import { PARAMETERS, Renderer, STRIDE } from "./renderer.js";
  * @property {number} refineEvery
  * @property {number} refineFrom
  * @property {number} refineUntil
+ * @property {number} threshold of the gradient, with the image spanning [-1, 1]
+ * @property {number} dense share of the extent: larger Gaussians are split
+ * @property {number} least opacity: Gaussians with less are removed
  * @property {number} most Gaussians
  * @property {[number, number][]} smaller factors of the photos, and the moments until which they are used
  * @property {number} ssim weight of 1 − SSIM in the loss
@@ -250,7 +253,7 @@ export class Trainer {
             each => new Float32Array(each),
         );
         const gradients = sums.map((sum, i) => sum / Math.max(1, views[i]));
-        this.load(refined(await this.state(), gradients, this.extent, this.recipe.most, this.random));
+        this.load(refined(await this.state(), gradients, this.extent, this.recipe, this.random));
     }
 
     /** The PSNR of the photos that are held out, or of some of the others, in dB. */
